@@ -373,3 +373,18 @@ def test_sets_of_concrete_numbers_can_be_created_under_tracing():
     inside_out = -radius
     with pytest.raises(dvax.InputError, match="must be finite and ≥ 0"):
         jax.jit(lambda t: sets.Ball(t, inside_out).project(jnp.ones(2), PLANE))(0.5)
+
+
+@pytest.mark.slow
+def test_bounds_of_a_moving_constrained_box_may_be_python_numbers():
+    """Traced once more, a number that depends on nothing is no array of JAX."""
+    ones = jnp.ones((1, 2))
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        K=lambda t, cap: sets.ConstrainedBox(0.0, 1.0, ones, jnp.zeros(1), cap * jnp.ones(1)),
+        f=lambda t, x, u, cap: u, h=lambda t, x, u, cap: 1.0 + 0.0 * x,
+    )  # fmt: skip
+    # u is half the cap, and x' = −x + u.
+    end = lambda cap: dvax.solve(problem, jnp.zeros(2), 0.0, 1.0, cap).xs[-1, 0]  # noqa: E731
+    value, slope_of_cap = jax.value_and_grad(end)(1.5)
+    np.testing.assert_allclose([value / 1.5, slope_of_cap], 0.5 * (1.0 - np.exp(-1.0)), rtol=1e-5)

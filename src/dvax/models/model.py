@@ -110,11 +110,13 @@ class Model:
             names = getattr(self, which)
             parts, entries = _counts(element)
             if names and len(names) not in (parts, entries):
+                of, source = ("x0", "x0") if which == "states" else ("u", "the control space")
                 wrong.add(
-                    f"dvax.models.Model({which})", ", ".join(names),
-                    f"it needs a name for each of the {entries} entries"
-                    + (f", or for each of the {parts} parts" if parts != entries else ""),
-                    "Add or remove names",
+                    f"dvax.models.Model({which})",
+                    f"{len(names)} name{'' if len(names) == 1 else 's'}: {', '.join(names)}",
+                    f"it needs a name for each of the {entries} entries of {of}"
+                    + (f", or for each of its {parts} parts" if 1 < parts < entries else ""),
+                    f"Add or remove names, or correct {source}",
                 )  # fmt: skip
         wrong.raise_any()
 

@@ -240,3 +240,58 @@ def test_resistance_of_a_circuit_takes_its_unit() -> None:
     given = {"name": "circuit", "netlist": "a.cir", "t_end": "5 ms", "r_on": "100 mohm"}
     table = CircuitSection.model_validate(given)
     assert (table.r_on, table.g_leak, table.t_end) == (0.1, None, 0.005)
+
+
+FLOOR = """
+[model]
+name = "thermostat"
+outdoor = "w.csv"
+gains = "w.csv"
+set_point = 20.0
+lengths = [4.0, 4.0]
+cells = [4, 4]
+diffusivity = "3 m^2/h"
+power_max = "200 W/m^2"
+t_end = "2 h"
+
+[[model.heaters]]
+x = [0.0, 1.0]
+y = [0.0, 1.0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("header", "rule", "fix"),
+    [
+        (
+            "time [h],outdoor [degF],gains [W/m^2]",
+            "it is in degC, and nothing is converted",
+            "degC",
+        ),
+        ("time [h],outdoor [K],gains [W/m^2]", "it is in degC, and nothing is converted", "degC"),
+        ("time [h],outdoor [°C],gains [W/m^2]", "it is in degC, and '°C' is not a unit", "degC"),
+        ("time [h],temp [degC],gains [W/m^2]", "exactly one besides 'time'", '"outdoor [degC]"'),
+        (
+            "time [min],outdoor [degC],gains [W/m^2]",
+            "(time [min] in the first row)",
+            "correct the unit",
+        ),
+    ],
+)
+def test_units_and_columns_of_a_file_are_named_with_those_that_are_meant(
+    tmp_path, header, rule, fix
+):
+    config = tmp_path / "a.toml"
+    config.write_text(FLOOR)
+    (tmp_path / "w.csv").write_text(f"{header}\n0,1.0,0.0\n3,2.0,0.0\n")
+    said = CliRunner().invoke(app, ["check", str(config)])
+    assert said.exit_code == 2
+    assert rule in said.stderr and fix in said.stderr and said.stderr.count("given:") == 1
+
+
+@pytest.mark.parametrize("name", ["modle", "Model", "modell"])
+def test_a_misspelt_table_of_the_model_is_named(tmp_path, name):
+    config = tmp_path / "a.toml"
+    config.write_text(f'[{name}]\nname = "python"\npython = "a.py"\n[model.parameters]\na = 1\n')
+    said = CliRunner().invoke(app, ["check", str(config)])
+    assert said.exit_code == 2 and "Did you mean [model]?" in said.stderr and name in said.stderr

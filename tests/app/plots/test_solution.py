@@ -13,7 +13,7 @@ from tests.once import once
 
 import dvax
 from dvax.app.plots.map_panel import MapPanel
-from dvax.app.plots.panels import Panel, panels_picture
+from dvax.app.plots.panels import Curve, Panel, panels_picture
 from dvax.app.plots.solution import entry_panels
 from dvax.app.plots.span_panel import SpanPanel, Spans
 from dvax.ensembles import Moments
@@ -76,6 +76,30 @@ def test_panels_show_states_responses_their_bounds_and_active_constraints():
     inside = [any(box.x0 <= t <= box.x1 for box in first) for t in TS]
     assert inside == clipped.tolist()
     assert "21 steps" in figure.get_suptitle() or "20 steps" in figure.get_suptitle()
+
+
+@pytest.mark.slow
+def test_bounds_and_conditions_of_a_constrained_box_are_named():
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.ConstrainedBox(0.0, 1.0, jnp.ones((1, 2)), jnp.zeros(1), jnp.full(1, 1.5)),
+        f=lambda t, x, u, args: 2.0 * jnp.sin(t + jnp.array([0.0, 1.5])) - u,
+        h=lambda t, x, u, args: 2.0 * x + 0.3,
+    )  # fmt: skip
+    sol = dvax.solve(problem, jnp.zeros(2), 0.0, 6.0, ts=np.linspace(0.0, 6.0, 61), dense=True)
+    rows = sol.plot(responses={"a": "MW", "b": "MW"}).axes[-1]
+    names = [label.get_text() for label in rows.get_yticklabels()]
+    assert {"a at the lower bound", "b at the upper bound", "row 0"} <= set(names)
+
+
+def test_panel_of_a_bound_that_is_infinite_says_so_and_has_no_numbers():
+    never = np.full(3, np.inf)
+    drawn = [Panel([Curve(np.arange(3.0), values, "a")], "a", log=True) for values in
+             (never, np.array([1e-16, np.inf, np.inf]), np.array([1e-3, 1e-2, np.inf]))]  # fmt: skip
+    figures = [panels_picture("a", "", "", [panel], "time") for panel in drawn]
+    shown = [bool(figure.still().axes[0].get_yticks().size) for figure in figures]
+    assert shown == [False, False, True]
+    assert [f.interactive.layout.yaxis.showticklabels for f in figures] == [False, False, True]
 
 
 def test_names_of_one_unit_share_a_panel_with_the_bounds_of_their_entries():

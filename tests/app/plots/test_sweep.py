@@ -23,6 +23,7 @@ RNG = np.random.default_rng(0)
         ([0.0, 1.0, 10.0, 100.0], False),
         ([-1.0, 10.0, 100.0], False),
         ([0.1, 10.0], False),
+        ([0.1, 1e5], True),
         ([np.nan, 1.0, np.inf, 10.0, 100.0], True),
         ([np.nan], False),
         ([1e10, 1e188, 1e190, 1e192], True),

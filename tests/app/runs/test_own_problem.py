@@ -134,7 +134,7 @@ def test_code_is_not_executed_without_the_flag(tmp_path):
     (HEAD + "def build(load): pass\n", TABLE, "each parameter has a type"),
     (HEAD + "def build():\n    return 3\n", TABLE, "it must return a dvax.models.Model"),
     (HEAD + "def build():\n    return 1 / 0\n", TABLE, "own.py, line 6: got ZeroDivisionError"),
-    ("import dvax\ndef build(:\n", TABLE, "own.py, line 2: got SyntaxError"),
+    ("import dvax\ndef build(:\n", TABLE, "own.py, line 2: got def build"),
     ("import no_such_module\n", TABLE, "own.py, line 1: got ModuleNotFoundError"),
     (POINT.replace('{"depth": "mm"}', '{"a": "", "b": ""}'), TABLE, "a name for each of the 1 entries"),
     (POINT.replace("x0, 2.0", "x0, -2.0"), TABLE, "t0 < t_end"),

@@ -17,6 +17,7 @@ from dvax.evolution.after_run import at_rows
 from dvax.evolution.plan import Plan
 from dvax.evolution.regimes import switch_count
 from dvax.evolution.setup import Setup
+from dvax.sets import ConstrainedBox, Polyhedron
 
 _MOST_ROWS = 12
 """Up to this many constraints that are ever active have a row each."""
@@ -78,24 +79,25 @@ def _signs(
     sol: Solution, times: np.ndarray, rows: tuple[Tree, Tree], box: Any, entries: list[str]
 ) -> tuple[np.ndarray, np.ndarray, list[Label]] | None:
     """Return the ends of intervals, and whether each constraint is active in each of them."""
-    like = sol.setup.problem.zero_control(sol.setup.x0)
+    problem, args = sol.setup.problem, _tree.as_arrays(sol.setup.args)
+    K, like = problem.set_at(sol.setup.number("t0"), args), problem.zero_control(sol.setup.x0)
     has_switches = switch_count(sol.setup) is not None
     saved = len(sol.ts) >= 2
     if has_switches and sol.records is not None and not (saved and len(entries) > _MOST_LOCATED):
         found = sol.regimes()
-        labels = _labels(like, entries, found.positive.shape[1], box is not None)
+        labels = _labels(K, like, entries, found.positive.shape[1])
         return found.times, ~found.positive, labels
     ends = edges(times)
     ends[[0, -1]] = times[[0, -1]]
     if box is not None:
         active = [_on_box(y, *pair) for y, *pair in zip(*map(jtu.tree_leaves, (rows[1], *box)))]
         columns = np.concatenate(active, axis=1)
-        return ends, columns, _labels(like, entries, columns.shape[1], True)
+        return ends, columns, _labels(K, like, entries, columns.shape[1])
     if not has_switches:
         return None
     given = times.astype(sol.ts.dtype), rows[0]
     columns = ~at_rows(_positive, sol.setup, _plan(sol), given)
-    return ends, columns, _labels(like, entries, columns.shape[1], False)
+    return ends, columns, _labels(K, like, entries, columns.shape[1])
 
 
 def _positive(setup: Setup, plan: Plan, rows: tuple[jax.Array, Tree]) -> jax.Array:
@@ -119,17 +121,22 @@ def _on_box(y: Any, lower: Any, upper: Any) -> np.ndarray:
     return np.concatenate([flat <= low + rounding, flat >= high - rounding], axis=1)
 
 
-def _labels(like: Tree, entries: list[str], count: int, is_box: bool) -> list[Label]:
+def _labels(K: Any, like: Tree, entries: list[str], count: int) -> list[Label]:
     """Return the labels of the constraints in the order of `AbstractSet.switches`: for each part of a
-    box the lower bounds of its entries, then the upper ones."""
-    if not is_box or count != 2 * len(entries):
+    box the lower bounds of its entries, then the upper ones, then the rows of conditions."""
+    has_bounds = K.intervals(like) is not None or isinstance(K, ConstrainedBox)
+    of_bounds = 2 * len(entries) if has_bounds else 0
+    if not isinstance(K, ConstrainedBox | Polyhedron) and count != of_bounds:
         return [(f"constraint {k}" if count > 1 else "constraint", _ACTIVE) for k in range(count)]
+    rows = [(f"row {k}", _ACTIVE) for k in range(count - of_bounds)]
+    if not has_bounds:
+        return rows
     labels: list[Label] = []
     rest = iter(entries)
     for leaf in jtu.tree_leaves(like):
         own = [next(rest) for _ in range(leaf.size)]
         labels += [(entry, kind) for kind in (_LOWER, _UPPER) for entry in own]
-    return labels
+    return labels + rows
 
 
 def _name(label: Label, labels: list[Label]) -> str:

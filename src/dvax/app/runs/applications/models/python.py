@@ -272,6 +272,11 @@ def _run(file: Path, work: Callable[[], Any]) -> Any:
         ) from error
     except DvaxError:
         raise
+    except SyntaxError as error:
+        raise input_error(
+            _line(file, error), f"{(error.text or '').strip()[:200]}",
+            f"the file must be valid Python: {error.msg}", "Correct that line",
+        ) from error  # fmt: skip
     except Exception as error:
         raise input_error(
             _line(file, error), f"{type(error).__name__}: {error}"[:300],
