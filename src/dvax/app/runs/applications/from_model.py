@@ -216,9 +216,11 @@ class AbstractModelApplication(abc.ABC):
         growth = log_growth(self.constants, self.t_end - self.own.t0)
         if growth + np.log(error) < 0 or not np.isfinite(growth):
             return ()
+        digits = growth / np.log(10)
+        factor = f"up to 1e{digits:.0f}" if digits <= 300 else "more than 1e300"
         return (
-            f"By these constants an error may grow by a factor of up to 1e{growth / np.log(10):.0f} "
-            f"over the run, so that the error bound may certify no digit. {self.remedy}",
+            f"By these constants an error may grow by a factor of {factor} over the run, so that the "
+            f"error bound may certify no digit. {self.remedy}",
         )
 
     def _choice(self) -> tuple[str, str]:

@@ -156,16 +156,10 @@ def _unknowns(model: Model) -> int:
 
 def _remedy(may_use_energy: bool) -> str:
     """Return what to try for a smaller bound."""
-    other = (
-        "constants of a region (constants=dvax.verify(problem, x0, x=(low, high)).constants of "
-        "dvax.models.Model), weights of the state space (state_space=dvax.spaces.L2(weights), with "
-        "control_space= if u has the shape of x) or a shorter run"
-    )
-    linear = "energy = true in [model], if the derivatives of f and h do not change,"
-    first = f"Try {linear}" if may_use_energy else "Try"
+    linear = "energy = true in [model] if f and h are affine, " if may_use_energy else ""
     return (
-        f"{first} {other}; the page Troubleshooting by message of the documentation "
-        "(docs/howto/troubleshooting.md) says more."
+        f"Try {linear}constants of a region in the Python file, weights of the state space, or a "
+        "shorter run: docs/howto/troubleshooting.md shows how."
     )
 
 
