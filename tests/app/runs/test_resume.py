@@ -95,8 +95,17 @@ def part(folder, tmp_path):
 
 
 def events(directory: Path, kind: str) -> list[dict]:
-    lines = (directory / "log.jsonl").read_text().splitlines()
-    return [event for event in map(json.loads, lines) if event["event"] == kind]
+    lines = (directory / "log.jsonl").read_text(errors="replace").splitlines()
+    return [event for line in lines if (event := intact(line)).get("event") == kind]
+
+
+def intact(line: str) -> dict:
+    """The event of a line of a log, {} where the line is damaged."""
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return {}
+    return event if isinstance(event, dict) else {}
 
 
 @pytest.mark.slow
