@@ -69,5 +69,5 @@ def _history(
             path.name, "one row", "a history has two rows at least", "Add the last time of the run"
         )
     times = in_unit(path.name, time, time_unit)
-    columns = {c.name: in_unit(path.name, c, units[c.name] or "1") for c in others}
-    return History(times, columns, time.unit)
+    found = {c.name: in_unit(path.name, c, units[c.name] or "1") for c in others}
+    return History(times, found, time.unit)
