@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
-from .._dataset import Variable, dataset, described, over, required
+from .._dataset import Names, Variable, dataset, described, over, required
 from .._repr import table, value_text
 from .._tree import Tree
 from ..errors import input_error
@@ -212,6 +212,7 @@ class Ensemble:
         ts: Any,
         quantiles: tuple[float, float] = (0.05, 0.95),
         *,
+        names: Names = None,
         name: str = "value",
         unit: str = "",
         time_unit: str = "",
@@ -222,8 +223,9 @@ class Ensemble:
         """Return a figure of the kept values over time: their mean, and the area between two quantiles
         of the members that succeeded.
 
-        **Arguments:** `ts`: the saved times, one for each row of the values; `name`, `unit`: of the
-        values; `title`, `backend`, `axes`: as in `dvax.Solution.plot`.
+        **Arguments:** `ts`: the saved times, one for each row of the values; `names`: of the entries of
+        the values, a dictionary of names and units or a list, or else `name`, `unit`: of the values as
+        a whole; `title`, `backend`, `axes`: as in `dvax.Solution.plot`.
 
         **Raises:** `ModuleNotFoundError` if Matplotlib or Plotly (the extra `dvax[app]`) is missing;
         `dvax.InputError` if values were not kept, or are not over these times.
@@ -234,7 +236,7 @@ class Ensemble:
         from ..app.plots.ensemble import plot_ensemble
 
         return plot_ensemble(
-            self, ts, quantiles, name=name, unit=unit, time_unit=time_unit, title=title,
+            self, ts, quantiles, names=names, name=name, unit=unit, time_unit=time_unit, title=title,
             backend=backend, axes=axes,
         )  # fmt: skip
 

@@ -228,6 +228,17 @@ def test_ensemble_has_the_mean_between_quantiles_of_its_members():
     extents = axes.collections[0].get_paths()[0].get_extents()
     assert (extents.y0, extents.y1) == (1.0, 9.0)
     assert figure.get_suptitle() == "11 members" and "[N]" in axes.get_ylabel()
+    three = eqx.tree_at(
+        lambda e: (e.values, e.moments.mean, e.moments.squares),
+        every,
+        (jnp.stack([values] * 3, axis=-1), jnp.full((21, 3), 5.0), jnp.ones((21, 3))),
+    )
+    rooms, heat = three.plot(TS, names={"room": "degC", "hall": "degC", "heat": "kW"}).axes
+    assert "room, hall" in rooms.get_ylabel() and "[kW]" in heat.get_ylabel()
+    handles = rooms.get_legend_handles_labels()[1]
+    assert handles == ["90 % of the members", "room, mean", "hall, mean"]
+    with pytest.raises(dvax.InputError, match="a name of its own for each of the 3 entries"):
+        three.plot(TS, names=["room", "hall"])
     with pytest.raises(dvax.InputError, match="Pass the same ts"):
         every.plot(TS[1:])
     with pytest.raises(dvax.InputError, match="keep=False"):

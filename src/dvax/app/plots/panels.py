@@ -258,7 +258,7 @@ def panels_picture(
                 trace.colorbar.update(
                     y=(low + high) / 2, yanchor="middle", len=high - low, lenmode="fraction"
                 )
-            shows = trace.showlegend is not False and trace.name is not None
+            shows = trace.showlegend is not False and bool(trace.name)
             shows &= (panel.has_legend or trace in lines) and trace.name not in named
             trace.update(showlegend=shows, legendgroup=trace.name)
             named |= {str(trace.name)} if shows else set()
