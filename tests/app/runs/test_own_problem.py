@@ -128,6 +128,8 @@ def test_code_is_not_executed_without_the_flag(tmp_path):
     (POINT, TABLE + "[model.parameters]\nload = true\n", "it must be a number (a parameter of build)"),
     (POINT, TABLE + '[model.parameters]\nlimit = "3 s"\n', 'Write "2.5 N"'),
     (POINT, TABLE + "t_end = -1.0\n", "model.t_end"),
+    (POINT, TABLE + 't_end = "5 mm"\n', 'a unit of time. Write "2.5 min"'),
+    (POINT, TABLE + "t_end = [1.0]\n", 'a unit of time. Write "2.5 h", say'),
     (POINT, TABLE.replace(":build", ":biuld"), "It has build"),
     (POINT, '[model]\nname = "python"\n', "it is required"),
     (POINT, TABLE.replace("own.py", "../own.py"), "model.python"),
@@ -206,3 +208,9 @@ def test_new_writes_a_problem_that_runs_and_whose_test_passes(tmp_path):
         capture_output=True, text=True, cwd=folder,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
+
+
+def test_end_of_a_run_may_have_a_unit_of_time(tmp_path):
+    file = written(tmp_path, POINT, TABLE + 't_end = "90 s"\n')
+    config = read_config(file, allow_code=True)
+    assert config.model.t_end == 1.5 and config.tree()["model"]["t_end"] == "90 s"

@@ -2,26 +2,38 @@
 
 import importlib.util
 import inspect
+import math
 import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import jax.tree_util as jtu
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PlainValidator, model_validator
 
 from dvax.app.runs.applications.base import Figure, Variable
 from dvax.app.runs.applications.certificate import Certificate
 from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
 from dvax.app.runs.applications.own_parameters import PREFIX, Parameters, complete, unit_of
+from dvax.app.runs.schema import rule_error
+from dvax.app.runs.units import converted
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
 from dvax.theory.energy import MAX_UNKNOWNS
+
+
+def _number_or_text(value: Any) -> float | str | None:
+    is_number = type(value) in (int, float) and math.isfinite(value)
+    if value is None or is_number or isinstance(value, str):
+        return float(value) if is_number else value
+    raise rule_error(
+        "it is a finite number, or a text with a number and a unit of time", 'Write "2.5 h", say'
+    )
 
 
 class PythonSection(FramesKeys):
@@ -35,7 +47,11 @@ class PythonSection(FramesKeys):
     parameters: dict[str, Any] = Field(
         default_factory=dict, description="the arguments of that function"
     )
-    t_end: float | None = Field(None, description="end of the run, by default that of the model")
+    t_end: Annotated[float | str | None, PlainValidator(_number_or_text)] = Field(
+        None,
+        description="end of the run, by default that of the model; a text such as '2 h' is converted "
+        "to its unit of time",
+    )
     certify: bool = Field(
         False,
         description="choose steps whose defect can be enclosed, and not the fastest ones; "
@@ -91,7 +107,7 @@ class PythonApplication(AbstractModelApplication):
             with problems.collect():
                 _check_energy(model)
         with problems.collect():
-            self.set_model(model, table.t_end)
+            self.set_model(model, _end(model, table.t_end))
         problems.raise_any()
 
     @classmethod
@@ -133,6 +149,20 @@ class PythonApplication(AbstractModelApplication):
         found = {} if of is None else _run(self.file, lambda: dict(of(end)))
         own = {n: Figure(*_figure(self.file, n, entry)) for n, entry in found.items()}
         return self.joined(self.final_values(end) | self.bound_figure(bound), own)
+
+
+def _end(model: Model, t_end: float | str | None) -> float | None:
+    """Return the end of the run in the unit of time of the model."""
+    if not isinstance(t_end, str):
+        return t_end
+    unit = model.time_unit
+    number = converted(t_end, unit) if unit else None
+    if number is None:
+        rule = f"it is a number in {unit}, or a text with a number and a unit of time"
+        without = "time has no unit in this model (time_unit= of dvax.models.Model)"
+        fix = f'Write "2.5 {unit}"' if unit else "Write a number without quotes"
+        raise input_error("model.t_end", repr(t_end), rule if unit else without, fix)
+    return number
 
 
 def _built(file: Path, function: str, build: Callable[[], Any]) -> Model:
