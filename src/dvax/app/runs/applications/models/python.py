@@ -28,9 +28,10 @@ from dvax.theory.energy import MAX_UNKNOWNS
 
 
 def _number_or_text(value: Any) -> float | str | None:
-    is_number = type(value) in (int, float) and math.isfinite(value)
-    if value is None or is_number or isinstance(value, str):
-        return float(value) if is_number else value
+    if type(value) in (int, float) and math.isfinite(value):
+        return float(value)
+    if value is None or isinstance(value, str):
+        return value
     raise rule_error(
         "it is a finite number, or a text with a number and a unit of time", 'Write "2.5 h", say'
     )
