@@ -31,7 +31,7 @@ _LIBRARIES = frozenset(
 ) | set(sys.stdlib_module_names)
 """Packages whose functions read nothing that a user changes."""
 
-_DEPTH = 4
+_DEPTH = 6
 """Levels of containers, objects and functions that are looked into."""
 
 _MAX_ENTRIES = 10_000

@@ -371,3 +371,18 @@ def test_a_value_is_told_apart_at_any_depth_of_functions_made_again(depth, wrap)
     assert one[0] != other[0]
     if depth == 0:
         assert one == parts(nested(depth, 2.0, wrap))
+
+
+def test_a_number_deep_in_containers_that_a_helper_reads_is_noticed():
+    settings = {"spring": {"stiffness": [0.5, {"bent": (2.0,)}]}}
+
+    def stiffness(k):
+        return settings["spring"]["stiffness"][k]
+
+    system = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 1.0),
+        f=lambda t, x, u, args: stiffness(0) * x - u, h=lambda t, x, u, args: 1.0 - x,
+    )  # fmt: skip
+    before, h = parts(system)
+    settings["spring"]["stiffness"][0] = 5.0
+    assert parts(system)[0] != before and parts(system)[1] == h

@@ -1,5 +1,7 @@
 """Boxes around K contain K, and a region of u that K implies restricts nothing."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -122,3 +124,27 @@ def test_bounds_of_a_moving_set_limit_the_region_of_u(kind):
     found = dvax.verify(problem, jnp.ones(2), 0.0, 3.0, x=(0.0, 1.0))
     assert found["ass:f_lipschitz"].status == "proved"
     assert 0.03 <= float(found.constants.alpha_f) <= 0.031
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shape", "total"),
+    [((4, 3), lambda t: 1.0 + 0.5 * t), ((4, 3), lambda t: jnp.ones(1) + 0.5 * t),
+     ((2, 4, 3), lambda t: jnp.array([[1.0], [2.0]]) + 0.5 * t),
+     ((4, 3), lambda t: 1.0 + 0.5 * t * jnp.arange(4.0))],
+)  # fmt: skip
+def test_speed_of_several_simplices_is_the_norm_of_their_speeds(shape, total):
+    """Far from K the projection is a corner: each simplex moves by the change of its total."""
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: dvax.sets.Simplex(total(t)),
+        f=lambda t, x, u, args: -u, h=lambda t, x, u, args: 0.1 * x,
+    )  # fmt: skip
+    row = dvax.verify(problem, jnp.zeros(shape), 0.0, 1.0)["ass:time_regularity (i)"]
+    z = jnp.zeros(shape).at[..., 0].set(99.0)
+    ends = (
+        dvax.sets.Simplex(total(t)).project(z, dvax.spaces.Euclidean(shape)) for t in (1.0, 0.0)
+    )
+    moved_by = float(jnp.linalg.norm(jnp.subtract(*ends)))
+    claimed = float(re.search(r"ω_K\(r\) = ([0-9.e+-]+) r", row.why).group(1))
+    assert row.status == "proved" and moved_by <= claimed * (1 + 1e-5) <= moved_by * (1 + 2e-5)

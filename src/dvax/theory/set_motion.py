@@ -158,7 +158,14 @@ def _describe(
     if isinstance(K, Simplex) and not isinstance(like, tuple) and K.blocks is None:
         total = jnp.broadcast_to(K.total[..., None], like.shape)
         heaviest = jnp.sqrt(jnp.max(space.weights()))
-        motion = _SumOfSpeeds(jnp.zeros_like(like), (heaviest * K.total,))
+        # A simplex moves by heaviest |Δtotal| at most, and the whole element by the norm of them all.
+        plain = jnp.sqrt(space.weights()) * jnp.ones_like(like)
+        first = (
+            jnp.zeros_like(like)
+            .at[..., :1]
+            .set(heaviest * jnp.broadcast_to(K.total[..., None], (*like.shape[:-1], 1)))
+        )
+        motion = _SumOfSpeeds(first / plain, ())
         return jnp.zeros_like(like), total, motion, K.total
     return None
 
