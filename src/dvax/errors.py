@@ -56,7 +56,7 @@ class InputError(DvaxError, ValueError):
     problems: tuple[InputProblem, ...]
 
     def __init__(self, *problems: InputProblem):
-        # Several keys may name one file.
+        # What several keys have in common, such as a file, is a problem once.
         self.problems = problems = tuple(dict.fromkeys(problems))
         super().__init__("\n".join(map(str, problems)))
 

@@ -1,6 +1,7 @@
 """Single members of an ensemble: their runs, and what is wrong with their data."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -44,20 +45,25 @@ class Alone:
 
     def _empty(self, times: Mapping[int, float]) -> dict[int, str]:
         found: dict[int, str] = {}
-        nearest = jax.jit(self._nearest_to_zero)
         for k, t in times.items():
             x0, args, *_ = self.inputs.member(k)
             at = f"at t = {t:.10g}"
             try:
                 self.problem.set_at(t, args)
-                if first_bad(nearest(t, x0, args)):
+                if first_bad(self._nearest(t, x0, args)):
                     found[k] = f"K is empty {at}."
             except InputError as refused:
                 first = refused.problems[0]
                 found[k] = f"K is refused {at}: {first.place}: got {first.given}; {first.rule}."
         return found
 
-    def _nearest_to_zero(self, t: Any, x0: Any, args: Any) -> Any:
+    @functools.cached_property
+    def _nearest(self) -> Any:
+        """The point of K(t) nearest to 0 as a compiled function of (t, x0, args)."""
         problem = self.problem
-        space = problem.spaces(x0)[1]
-        return problem.set_at(t, args).project(problem.zero_control(x0), space)
+
+        def nearest(t: Any, x0: Any, args: Any) -> Any:
+            space = problem.spaces(x0)[1]
+            return problem.set_at(t, args).project(problem.zero_control(x0), space)
+
+        return jax.jit(nearest)

@@ -158,14 +158,9 @@ def _describe(
     if isinstance(K, Simplex) and not isinstance(like, tuple) and K.blocks is None:
         total = jnp.broadcast_to(K.total[..., None], like.shape)
         heaviest = jnp.sqrt(jnp.max(space.weights()))
-        # A simplex moves by heaviest |Δtotal| at most, and the whole element by the norm of them all.
-        plain = jnp.sqrt(space.weights()) * jnp.ones_like(like)
-        first = (
-            jnp.zeros_like(like)
-            .at[..., :1]
-            .set(heaviest * jnp.broadcast_to(K.total[..., None], (*like.shape[:-1], 1)))
-        )
-        motion = _SumOfSpeeds(first / plain, ())
+        # One total for each simplex, where they share it.
+        totals = jnp.broadcast_to(K.total, like.shape[:-1])
+        motion = _SumOfSpeeds(jnp.zeros_like(like), (heaviest * totals,))
         return jnp.zeros_like(like), total, motion, K.total
     return None
 
@@ -178,7 +173,8 @@ class _MaximumSpeed(NamedTuple):
 
 
 class _SumOfSpeeds(NamedTuple):
-    """The speed of the projection is at most the sum of the speeds of the element and the numbers."""
+    """The speed of the projection is at most the sum of the speeds of the element and of each array of
+    numbers, in their norms."""
 
     element: Tree
     numbers: tuple[Any, ...]
@@ -191,7 +187,7 @@ def _speed(motion: Any, space: AbstractSpace, like: Tree) -> float:
         number_speed = 0.0
     else:
         entries = [_entry_speed(v) for v in slopes(motion.element)]
-        number_speed = sum(float(np.sum(_entry_speed(v))) for v in slopes(motion.numbers))
+        number_speed = sum(float(np.linalg.norm(_entry_speed(v))) for v in slopes(motion.numbers))
     scales = [r.reshape(v.shape) for r, v in zip(roots(space, like), jtu.tree_leaves(like))]
     squares = (np.sum((r * e) ** 2) for r, e in zip(scales, entries, strict=True))
     return float(np.sqrt(sum(squares))) + number_speed

@@ -97,8 +97,8 @@ def test_panel_of_a_bound_that_is_infinite_says_so_and_has_no_numbers():
     drawn = [Panel([Curve(np.arange(3.0), values, "a")], "a", log=True) for values in
              (never, np.array([1e-16, np.inf, np.inf]), np.array([1e-3, 1e-2, np.inf]))]  # fmt: skip
     figures = [panels_picture("a", "", "", [panel], "time") for panel in drawn]
-    shown = [bool(figure.still().axes[0].get_yticks().size) for figure in figures]
-    assert shown == [False, False, True]
+    has_ticks = [bool(figure.still().axes[0].get_yticks().size) for figure in figures]
+    assert has_ticks == [False, False, True]
     assert [f.interactive.layout.yaxis.showticklabels for f in figures] == [False, False, True]
 
 

@@ -242,7 +242,7 @@ def _bound_panel(bound: Any) -> Panel:
     for k, (name, values, dash) in enumerate((("x", bound.x, "solid"), ("u", bound.u, "dash"))):
         values = np.asarray(values, float)
         above = ~(values <= LARGEST)
-        since = f" (infinite from t = {ts[np.argmax(above)]:.4g} on)" if above.any() else ""
+        since = f" (states nothing from t = {ts[np.argmax(above)]:.4g} on)" if above.any() else ""
         curves.append(Curve(ts, values, f"bound on the error of {name}{since}", k, dash))
     return Panel(curves, f"error bound<br>({bound.status})", log=True)
 

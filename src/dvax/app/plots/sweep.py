@@ -66,7 +66,7 @@ class _Axis:
     @property
     def is_wide(self) -> bool:
         """Whether the values need a logarithmic axis: over a decade or more, and spread more evenly by
-        their logarithms than by themselves; or over twelve decades."""
+        their logarithms than by themselves; or over twelve decades, three for two values."""
         values = np.unique(self.values[np.isfinite(self.values)]).astype(float)
         if len(values) < 2 or not 0 < 10 * values[0] <= values[-1]:
             return False

@@ -120,11 +120,11 @@ def _rearranged(eqn: Any, operands: tuple[Any, ...], form: _Form, behind: int = 
     if places is None or (places < 0).any():
         return None
 
-    def moved(v: Values) -> Values:
+    def rearranged(v: Values) -> Values:
         tail = v.shape[v.ndim - behind :] if behind else ()
         return v.reshape(-1, *tail)[places]
 
-    return form.map(moved)
+    return form.map(rearranged)
 
 
 def _form(value: Any, depth: int = _DEPTH) -> _Form:

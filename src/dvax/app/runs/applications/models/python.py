@@ -28,6 +28,7 @@ from dvax.theory.energy import MAX_UNKNOWNS
 
 
 def _number_or_text(value: Any) -> float | str | None:
+    """Check the end of a run, whose unit is known when the model is built."""
     if type(value) in (int, float) and math.isfinite(value):
         return float(value)
     if value is None or isinstance(value, str):
