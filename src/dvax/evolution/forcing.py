@@ -52,13 +52,13 @@ def groups(flow: Flow, t: Any, x: Tree, chosen: Sequence[bool] | None = None) ->
     return (*((k,) for k in alone), *([tuple(together)] if together else []))
 
 
-def parameters(flow: Flow, chosen: Groups) -> list[jax.Array]:
+def parameters(flow: Flow, chosen: Groups) -> list[Any]:
     """Return the arrays of these parameters, one after the other."""
     leaves, _ = _parts(flow)
     return [leaves[k] for group in chosen for k in group]
 
 
-def with_parameters(flow: Flow, chosen: Groups, values: list[jax.Array]) -> Flow:
+def with_parameters(flow: Flow, chosen: Groups, values: list[Any]) -> Flow:
     """Return the flow with other values of these parameters."""
     leaves, rebuild = _parts(flow)
     for k, value in zip((k for group in chosen for k in group), values, strict=True):
@@ -79,7 +79,7 @@ def directions(flow: Flow, chosen: Groups, weights: jax.Array) -> list[jax.Array
     return found
 
 
-def _parts(flow: Flow) -> tuple[list[jax.Array], Callable[[list[Any]], tuple[Any, Any]]]:
+def _parts(flow: Flow) -> tuple[list[Any], Callable[[list[Any]], tuple[Any, Any]]]:
     """Return the arrays of the problem and of args, and how they make both."""
     arrays, static = eqx.partition((flow.problem, flow.args), eqx.is_array)
     leaves, tree = jtu.tree_flatten(arrays)
