@@ -8,23 +8,24 @@ and estimated if the defect is sampled.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 
 from .. import _tree
 from .._captured import Reads
-from .._tree import Tree
+from .._once import once_per_object
 from ..errors import InputError, Problems, input_error
 from ..problem import Problem
-from ..spaces import AbstractSpace
 from .defect import ROUNDINGS
 from .growth import between, disturbance, gronwall
 from .results import RESULTS
+from .setup import Setup
+from .signature import Signature, flatten
 from .solution import Solution
 
 _FIRST_RUN_FACTOR = 100.0
@@ -49,27 +50,26 @@ _REQUIRED_CONSTANTS = ("M", "growth_rate", "beta_f", "norm_P_inv", "gamma")
 def certified(
     run: Callable[[Any, float], Solution],
     ts: Any,
-    problem: Problem,
-    x0: Tree,
-    args: Any,
-    t0: float,
-    t1: float,
+    setup: Setup,
     constants: Any,
     tol: float,
     max_steps: int,
+    throw: bool,
 ) -> Solution:
     """Return a solution whose error bound is at most `tol` at every saved time.
 
-    `run(ts, atol)` solves with this absolute tolerance and rtol = 0.
+    `run(ts, atol)` solves with this absolute tolerance and rtol = 0, and raises where that fails if
+    `throw`.
 
     **Raises:** `dvax.InputError` if `tol` is out of reach, because of roundoff or of `max_steps`.
     """
-    _check(constants, tol, x0)
-    _check_domain(problem, constants, args, t0, t1)
-    growth, span = _growth(constants), t1 - t0
+    growth = _checked_growth(constants, tol, setup)
+    problem, t0, t1 = setup.problem, setup.setting["t0"], setup.setting["t1"]
+    _check_domain(problem, constants, setup.args, t0, t1)
+    span = t1 - t0
     amplification = growth.amplification(span)
-    size, largest = (float(v) for v in _sizes(problem, jnp.asarray(t0), x0, _tree.as_arrays(args)))
-    eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(x0))).eps)
+    size, largest = _sizes(setup)
+    eps = float(jnp.finfo(setup.dtype).eps)
     reachable = _RATE_ROUNDOFF * eps * largest * amplification
     if not tol >= reachable:
         raise _out_of_reach(tol, reachable, growth, span, "the roundoff of f alone grows to that")
@@ -81,21 +81,21 @@ def certified(
     before, bound, steps = np.inf, np.inf, 0
     for _ in range(_MAX_RUNS):
         solution = run(ts, atol)
-        if solution.result != RESULTS.successful:
-            return solution  # throw=False: the result says what failed, and nothing is certified
-        bounds, _ = _bounds(solution, growth, t0)
-        of_steps, of_time = _roundoff(solution, growth, max(size, largest), t0, t1)
+        if not throw and solution.result != RESULTS.successful:
+            return solution  # the result says what failed, and nothing is certified
+        of_defect, largest_x = _assess(solution, growth)
+        of_steps, of_time = _roundoff(solution, growth, largest_x, max(size, largest), eps)
         if of_steps + of_time > 0.5 * tol:
             reason = f"roundoff of x in {int(solution.stats['steps'])} steps, and of t"
             least = max(2.0 * (of_steps + of_time), reachable)
             raise _out_of_reach(tol, least, growth, span, reason)
         # That of the steps is part of their defect.
-        last, bound = bound, float(np.max(np.asarray(bounds))) + of_time
+        last, bound = bound, of_defect + of_time
         if bound <= tol:
             if of_region(constants):
                 # The same steps with more saved times, which make the bounds between them sharper.
                 denser = run(np.linspace(t0, t1, _REGION_CHECKS + 1)[1:], atol)
-                exit_time = _exit_time(denser, constants, _bounds(denser, growth, t0)[1])
+                exit_time = _exit_time(denser, constants, _bounds_between(denser, growth))
                 if exit_time is not None:
                     raise _outside(exit_time)
             return _with_bound(solution, bound)
@@ -146,10 +146,7 @@ def _order(solution: Solution) -> int:
 
 
 class _Growth(NamedTuple):
-    """The growth of disturbances: pairs (M, c) in `rates`, and constants of the problem.
-
-    They are copied once, because each read of some properties of `Constants` computes a bound.
-    """
+    """The growth of disturbances: pairs (M, c) in `rates`, and constants of the problem."""
 
     rates: list[tuple[float, float]]
     beta_f: float
@@ -161,51 +158,80 @@ class _Growth(NamedTuple):
         return min(M * _convolved(rate, span) for M, rate in self.rates)
 
 
-def _growth(constants: Any) -> _Growth:
+def _growth(constants: Any) -> _Growth | list[str]:
     """Return the growth pairs: (M, c) of the paper, (1, μ) one-sided, and that of an energy norm, as
-    far as `constants` has them."""
+    far as `constants` has them; or the names of the constants that are missing."""
+    known: dict[str, Any] = {name: getattr(constants, name, None) for name in _REQUIRED_CONSTANTS}
+    missing = [name for name, value in known.items() if value is None]
+    if missing:
+        return missing
     one_sided, energy = (getattr(constants, name, None) for name in ("one_sided", "energy"))
-    rates = [(float(constants.M), float(constants.growth_rate))]
+    rates = [(float(known["M"]), float(known["growth_rate"]))]
     rates += [] if one_sided is None else [(1.0, float(one_sided))]
     rates += [] if energy is None else [(float(energy[0]), float(energy[1]))]
-    return _Growth(rates, *(float(getattr(constants, name)) for name in _Growth._fields[1:]))
+    return _Growth(rates, *(float(known[name]) for name in _Growth._fields[1:]))
 
 
-@eqx.filter_jit
-def _sizes(problem: Problem, t0: jax.Array, x0: Tree, args: Any) -> tuple[jax.Array, jax.Array]:
-    """Return ‖1‖ and the size of x or of f, whichever is larger.
+_growth_of_module = once_per_object(_growth)
+
+
+def _sizes(setup: Setup) -> tuple[float, float]:
+    """Return ‖1‖ and the size of x or of f, whichever is larger, at t0.
 
     The response is set to zero, because solving for it takes much longer to compile.
     """
+    numbers, signature = flatten((setup.problem,), (setup.x0, setup.args), None)
+    size, largest = np.asarray(_sizes_of(numbers, setup.setting["t0"], signature))
+    return float(size), float(largest)
+
+
+@partial(jax.jit, static_argnums=2)
+def _sizes_of(numbers: list[Any], t0: Any, signature: Signature) -> jax.Array:
+    (problem,), (x0, args) = signature.unflatten(numbers)
     space = problem.spaces(x0)[0]
-    rate = problem.f(t0, x0, problem.zero_control(x0), args)
-    return jnp.sqrt(space.size()), jnp.maximum(space.norm(rate), space.norm(x0))
+    t = jnp.asarray(t0, _tree.dtype(x0))
+    rate = problem.f(t, x0, problem.zero_control(x0), _tree.as_arrays(args))
+    return jnp.stack([jnp.sqrt(space.size()), jnp.maximum(space.norm(rate), space.norm(x0))])
 
 
-def _bounds(solution: Solution, growth: _Growth, t0: float) -> tuple[jax.Array, jax.Array]:
-    """Return the bounds at every saved time, and on the interval from the last one to it."""
+def _assess(solution: Solution, growth: _Growth) -> tuple[float, float]:
+    """Return the largest error bound at the saved times, and the largest norm of x."""
+    data = (solution.setup.x0, solution.xs, solution.ts, _integrated(solution))
+    numbers, signature = flatten((solution.setup.problem,), data, None)
+    bound, norm = np.asarray(_assessed(numbers, growth, solution.setup.setting["t0"], signature))
+    return float(bound), float(norm)
+
+
+@partial(jax.jit, static_argnums=3)
+def _assessed(numbers: list[Any], growth: _Growth, t0: Any, signature: Signature) -> jax.Array:
+    (problem,), (x0, xs, ts, integrated) = signature.unflatten(numbers)
+    space = problem.spaces(x0)[0]
+    norm = jnp.maximum(jnp.max(jax.vmap(space.norm)(xs)), space.norm(x0))
+    bound = jnp.max(_smallest_bounds(t0, ts, integrated, growth)[0])
+    return jnp.stack([bound, norm.astype(bound.dtype)])
+
+
+def _bounds_between(solution: Solution, growth: _Growth) -> jax.Array:
+    """Return the error bounds on the intervals from each saved time, or t0, to the next one."""
+    t0 = solution.setup.setting["t0"]
+    return _smallest_bounds(t0, solution.ts, _integrated(solution), growth)[1]
+
+
+def _integrated(solution: Solution) -> tuple[Any, Any]:
+    """Return the integrated defects of the state and of the law, and those of the completed steps."""
     assert solution.defect is not None and solution.completed_defect is not None
-    integrated = (solution.defect, solution.law_defect), solution.completed_defect
-    return _smallest_bounds(t0, solution.ts, integrated, growth)
+    return (solution.defect, solution.law_defect), solution.completed_defect
 
 
 def _roundoff(
-    solution: Solution, growth: _Growth, rate: float, t0: float, t1: float
+    solution: Solution, growth: _Growth, size: float, rate: float, eps: float
 ) -> tuple[float, float]:
-    """Return bounds on the error due to roundoff: of x in all steps, and of t, with |x'| of the size
-    `rate`."""
-    space = solution.setup.problem.spaces(solution.setup.x0)[0]
-    size = float(_largest_norm(space, solution.setup.x0, solution.xs))
-    eps = float(jnp.finfo(solution.setup.dtype).eps)
-    steps = int(solution.stats["steps"])
+    """Return bounds on the error due to roundoff: of x, of this `size`, in all steps, and of t, with
+    |x'| of the size `rate`."""
+    t0, t1 = solution.setup.setting["t0"], solution.setup.setting["t1"]
     factor = min(M * np.exp(min(max(c, 0.0) * (t1 - t0), 700.0)) for M, c in growth.rates)
-    of_steps = ROUNDINGS * steps * size
+    of_steps = ROUNDINGS * int(solution.stats["steps"]) * size
     return float(factor) * eps * of_steps, ROUNDINGS * eps * max(abs(t0), abs(t1)) * rate
-
-
-@eqx.filter_jit
-def _largest_norm(space: AbstractSpace, x0: Tree, xs: Tree) -> jax.Array:
-    return jnp.maximum(jnp.max(jax.vmap(space.norm)(xs)), space.norm(x0))
 
 
 @jax.jit
@@ -302,16 +328,12 @@ def _out_of_reach(
     )
 
 
-def _check(constants: Any, tol: Any, x0: Tree) -> None:
-    missing = [name for name in _REQUIRED_CONSTANTS if getattr(constants, name, None) is None]
-    if constants is None or missing:
-        raise input_error(
-            "dvax.solve(constants)",
-            "None" if constants is None else f"no {', '.join(missing)}",
-            "a bound on the error rests on the constants of the problem",
-            "Give dvax.Constants, or constants=dvax.verify(problem, x0).constants",
-        )
-    if not _tree.is_concrete(tol, x0, constants):
+def _checked_growth(constants: Any, tol: Any, setup: Setup) -> _Growth:
+    """Return the growth of disturbances.
+
+    **Raises:** `dvax.InputError` if a constant is missing, or a value traced, or `tol` not positive.
+    """
+    if not _tree.is_concrete(tol, setup.x0, setup.setting, constants):
         raise input_error(
             "dvax.solve(certified_tol)",
             "a traced value",
@@ -323,3 +345,13 @@ def _check(constants: Any, tol: Any, x0: Tree) -> None:
             "dvax.solve(certified_tol)", str(tol), "it must be a positive number",
             "Give the largest error of x, in the norm of the state space, that is allowed",
         )  # fmt: skip
+    is_module = isinstance(constants, eqx.Module)
+    growth = _growth_of_module(constants) if is_module else _growth(constants)
+    if not isinstance(growth, _Growth):
+        raise input_error(
+            "dvax.solve(constants)",
+            "None" if constants is None else f"no {', '.join(growth)}",
+            "a bound on the error rests on the constants of the problem",
+            "Give dvax.Constants, or constants=dvax.verify(problem, x0).constants",
+        )
+    return growth

@@ -169,15 +169,8 @@ def solve(
     )  # fmt: skip
     if certified_tol is not None:
         _only_adaptive(dt, method)
-        check(call._replace(rtol=0.0, atol=1.0))
-        most = bound_steps(max_steps, False, t0, t1, None)
-
-        def run(times: Any, atol: float) -> Solution:
-            own = call._replace(ts=times, rtol=0.0, atol=atol, horizon=None, certified_tol=None)
-            return solve(**own._asdict())
-
-        begin, end = float(t0), float(t1)
-        return certified(run, ts, problem, x0, args, begin, end, constants, certified_tol, most)
+        # The tolerances of its runs follow from the constants.
+        call = call._replace(rtol=0.0, atol=1.0, horizon=None)
     check(call)
     _user_code.check_args(args, "dvax.solve")
     if save is not None:
@@ -194,17 +187,29 @@ def solve(
             progress,
         )  # fmt: skip
     if dt is None:
-        warn_precision(x0, rtol)
+        warn_precision(x0, call.rtol)
     call, choice = _chosen(call)
     setup, options = arranged(call, choice.method)
     first = key_of_first_run(problem, t0, x0, args)
     if first is not None:
         check_before_first_run(problem, t0, t1, x0, args)
-    solution = _run(choice, setup, None if ts is None else _times(ts), options, throw)
+    times = None if ts is None else _times(ts)
+    if certified_tol is None:
+        solution = _run(choice, setup, times, options, throw)
+    else:
+
+        def run(ts: Any, atol: float) -> Solution:
+            own = setup._replace(setting={**setup.setting, "atol": atol})
+            return _run(choice, own, ts, options, throw)
+
+        most = options.max_steps
+        solution = certified(run, times, setup, constants, certified_tol, most, throw)
     if first is not None:
         adaptive = dt is None and not isinstance(choice.method, PiecewiseLinear)
         saved = (solution.ts, solution.xs) if adaptive else None
-        warn_after_first_run(first, problem, t0, x0, args, constants, saved, atol)
+        warn_after_first_run(
+            first, problem, t0, x0, args, constants, saved, solution.setup.setting["atol"]
+        )
     return solution
 
 
