@@ -12,8 +12,9 @@ from .._tree import Tree
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
 from .certificate import is_declared
 from .modulus_status import ModulusStatuses
+from .projection_speed import slopes
 from .region import Region
-from .set_motion import SetMotion, bounded_in_time, jumps, slopes, times
+from .set_motion import SetMotion, bounded_in_time, jumps, times
 from .status import Status, weakest
 from .system import System
 
@@ -225,7 +226,8 @@ def _moving_feedback(
             for x in slopes(enclosure(piece, finite_region.x, finite_region.u).out):
                 for part in x.parts.values():
                     fastest = np.abs(part.center) + part.radius
-                    speed = max(speed, float(np.max(fastest, initial=0.0)))
+                    # `max` would drop NaN.
+                    speed = float(np.maximum(speed, np.max(fastest, initial=0.0)))
         if np.isfinite(speed):
             speed_text = f", |∂h/∂t| ≤ {speed:.6g}" if speed < 1e50 else ""
             return Assumption(

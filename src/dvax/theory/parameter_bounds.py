@@ -23,8 +23,9 @@ from .constants import Constants
 from .formulas import growth_integral
 from .modulus_status import modulus_statuses
 from .parameters import ParameterBounds, ParameterSet
+from .projection_speed import slopes
 from .region import Region, as_intervals
-from .set_motion import set_motion, slopes, times
+from .set_motion import set_motion, times
 from .status import Status
 from .system import System
 from .verify import (

@@ -39,6 +39,9 @@ def _add(eqn: Any, operands: list[Any]) -> Slope:
 
 def _sub(eqn: Any, operands: list[Any]) -> Slope:
     x, y = _lifted(eqn, operands)
+    is_same = x.source is not None and y.source is not None and x.source.key == y.source.key
+    if is_same and bool(np.isfinite(x.low).all() and np.isfinite(x.high).all()):
+        return Slope(np.zeros_like(x.low), np.zeros_like(x.low), {})
     return Slope(x.low - y.high, x.high - y.low, added(x, y, -1.0))
 
 
