@@ -1,7 +1,9 @@
 """Partial evaluation: the same values and derivatives, and constants computed once."""
 
+from collections.abc import Callable
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,3 +134,40 @@ def test_gradient_through_a_moving_polyhedron_agrees_with_differences():
     at, size = jnp.array([1.0, 0.9, 0.5]), 1e-5
     differences = [(total(at + size * e) - total(at - size * e)) / (2 * size) for e in np.eye(3)]
     assert np.allclose(jax.grad(total)(at), differences, rtol=1e-5, atol=1e-6)
+
+
+class _MovingHalfPlane(dvax.sets.AbstractSet):
+    """{y : y₀ ≤ b}, where b is the value of a function that has the time in its closure."""
+
+    bound: Callable[[], jax.Array] = eqx.field(static=True)
+
+    def project(self, z, space):
+        return z.at[0].min(self.bound())
+
+    def switches(self, z, space):
+        return [self.bound() - z[0]]
+
+    def intervals(self, like):
+        return None
+
+    def check(self, like):
+        pass
+
+
+@pytest.mark.slow
+def test_a_set_of_a_user_may_hold_a_function_of_time():
+    """Its structure contains a traced value, and must not be used after the call that made it."""
+    mixed = jnp.array([[1.0, 0.4], [-0.2, 1.0]])
+
+    def end(K):
+        problem = dvax.Problem(
+            A=dvax.generators.Scalar(-1.0), P=dvax.operators.Dense(jnp.array([[2.0, 0.3], [0.3, 1.0]])),
+            K=K, f=lambda t, x, u, args: u, h=lambda t, x, u, args: 1.0 - mixed @ x,
+        )  # fmt: skip
+        return dvax.solve(problem, jnp.array([0.3, 0.1]), 0.0, 2.0, rtol=1e-8, atol=1e-8).xs[-1]
+
+    expected = end(
+        lambda t, args: dvax.sets.HalfSpace(jnp.array([1.0, 0.0]), 0.5 + 0.3 * jnp.sin(t))
+    )
+    found = end(lambda t, args: _MovingHalfPlane(lambda: 0.5 + 0.3 * jnp.sin(t)))
+    assert np.allclose(found, expected, atol=1e-6)

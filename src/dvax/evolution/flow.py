@@ -26,6 +26,7 @@ from ..programs.enclosure import (
 from ..programs.partial_evaluation import PartialEvaluation
 from ..programs.structure import analyse
 from ..sets import AbstractSet, Polyhedron
+from ..sets._library import is_of_library
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
 from ..vi.known import Known
@@ -95,12 +96,16 @@ class Flow(eqx.Module):
         if not self.iterates:
             return self
         like, space = self.problem.zero_control(x), self.problem.spaces(x)[1]
+        known = True
 
         def K(t: Any) -> AbstractSet:
+            nonlocal known
             K = self.problem.set_at(t, self.args)
+            known = is_of_library(K)
             return K.prepared(like, space) if isinstance(K, Polyhedron) else K
 
-        return dataclasses.replace(self, prepared=PartialEvaluation.of(K, t))
+        prepared = PartialEvaluation.of(K, t)
+        return dataclasses.replace(self, prepared=prepared) if known else self
 
     def set_at(self, t: Any) -> AbstractSet:
         """Return K(t)."""

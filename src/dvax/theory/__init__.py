@@ -2,8 +2,8 @@
 
 from . import formulas as formulas
 from .assumptions import Assumption as Assumption
+from .bound_error import bound_error as bound_error
 from .certificate import Bound as Bound
-from .certificate import bound_error as bound_error
 from .constants import Constants as Constants
 from .constants import Row as Row
 from .parameter_bounds import parameter_bounds as parameter_bounds

@@ -114,49 +114,10 @@ class Bound(eqx.Module):
         return dataset("Bound.to_xarray", variables, {"time": time}, {"status": self.status})
 
 
-def bound_error(
-    problem: Problem, sol: Solution, constants: Constants, *, initial_error: Any = 0.0
+def bound_by_constants(
+    problem: Problem, sol: Solution, constants: Constants, initial_error: Any = 0.0
 ) -> Bound:
-    """Bound the error of a computed trajectory at its saved times.
-
-    **Arguments:** `problem` and `sol`, the solution of it; `constants`, its moduli; `initial_error`,
-    a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues from its last
-    saved state. (With M > 1 every piece multiplies the bound by M.)
-
-    If the solve did not record its defect (fixed steps), or the bounds of its trajectory (for constants
-    of a region that were not passed to it), the problem is solved again with the same steps, and the
-    distance of the two runs is added.
-
-    Constants that `dvax.verify` found for a region of x or u hold while the trajectory stays in it.
-    If the enclosure of the trajectory up to a saved time, enlarged by its bound, is not inside the
-    region, the bounds are infinite from there on. (Between two saved times the enlargement uses the
-    bound at the earlier one and all disturbances since, so more saved times make it sharper.) For
-    times or `args` other than those verified the status is "declared". With a region of u, the
-    bounds concern the solution whose response stays in it; a law that is monotone only there may
-    have other solutions.
-
-    Events that are only recorded change no step, and no bound. A run that a terminal event ended has
-    bounds at its saved times, its last one included: they compare the two trajectories at the same
-    time, and the exact one may meet its own event a little earlier or later. Events with a reset are
-    refused.
-
-    The bound is proved where the defect of `sol` is enclosed: solve with these `constants=`, or name
-    `method=dvax.ETD2RK()`. Where the defect was sampled, it is an estimate.
-
-    **Raises:** `dvax.InputError` if `sol` is not a solution of `problem`, has events with a
-    reset, or `initial_error` is not a number ≥ 0.
-
-    ```python
-    >>> import dvax
-    >>> model = dvax.models.Contact(alpha=1.0, beta=1.0, b_x=2.0, b_u=1.0, d_x=0.5, d_u=1.0,
-    ...                             kappa0=0.5, g=1.0, ell=3.0)
-    >>> sol = dvax.solve(model.problem, -1.0, 0.0, 2.0, rtol=1e-6, constants=model.constants)
-    >>> bound = dvax.bound_error(model.problem, sol, model.constants)
-    >>> bool(bound.x[-1] >= abs(sol.xs[-1] - 1.8360919559905713)), bound.status
-    (True, 'proved')
-
-    ```
-    """
+    """Return the bound of `dvax.bound_error` with these constants."""
     problem = current(problem)
     _check(problem, sol, constants, initial_error)
     return _bound_error(
@@ -175,7 +136,7 @@ def continue_bound(problem: Problem, sol: Solution, constants: Constants, before
     problem = current(problem)
     _check(problem, sol, constants, before)
     if before.integrals is None:
-        return bound_error(problem, sol, constants, initial_error=before)
+        return bound_by_constants(problem, sol, constants, before)
     return _bound_error(problem, sol, constants, tuple(before.integrals[-1]))
 
 
@@ -336,19 +297,29 @@ def _bound_since_previous_time(
 
 
 def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> None:
-    problems = Problems(
-        InputProblem(
-            f"dvax.bound_error({name})", type(value).__name__, f"it must be a {kind}",
-            f"Pass {source}",
-        )
-        for name, value, is_valid, kind, source in (
-            ("sol", sol, isinstance(sol, Solution), "dvax.Solution", "the result of dvax.solve"),
-            ("constants", constants, isinstance(constants, Constants), "dvax.Constants",
-             "dvax.verify(problem, x0).constants; if that is None, its table() says what is missing"),
-        )
-        if not is_valid
-    )  # fmt: skip
-    problems.raise_any()
+    if not isinstance(constants, Constants):
+        raise input_error(
+            "dvax.bound_error(constants)", type(constants).__name__, "it must be a dvax.Constants",
+            "Pass dvax.verify(problem, x0).constants; if that is None, its table() says what is "
+            "missing. If they are omitted, they are proved along the trajectory",
+        )  # fmt: skip
+    check_bounded(problem, sol, initial_error)
+    if isinstance(sol.setup.method, Implicit):
+        raise input_error(
+            "dvax.bound_error(sol)", "a solution of dvax.Implicit",
+            "an implicit method keeps no polynomials of its steps, so its defect is unknown",
+            "Solve with an exponential method, or omit the constants",
+        )  # fmt: skip
+
+
+def check_bounded(problem: Problem, sol: Any, initial_error: Any) -> None:
+    """Raise an `InputError` if the solution is not of this problem, or its initial error is invalid."""
+    problems = Problems()
+    if not isinstance(sol, Solution):
+        raise input_error(
+            "dvax.bound_error(sol)", type(sol).__name__, "it must be a dvax.Solution",
+            "Pass the result of dvax.solve",
+        )  # fmt: skip
     solved = current(sol.setup.problem)
     if solved is not problem and solved != problem:
         problems.add(
@@ -357,13 +328,6 @@ def _check(problem: Problem, sol: Any, constants: Any, initial_error: Any) -> No
             "from around it (a global, a closure, an attribute)",
             "the certificate evaluates the defect of this problem",
             "Pass the problem that was solved, and values that change in args",
-        )
-    if isinstance(sol.setup.method, Implicit):
-        problems.add(
-            "dvax.bound_error(sol)",
-            "a solution of dvax.Implicit",
-            "an implicit method keeps no polynomials of its steps, so its defect is unknown",
-            "Solve with an exponential method",
         )
     if any(event.reset is not None for event in sol.setup.events):
         problems.add(

@@ -14,9 +14,6 @@ from .one_sided import one_sided
 from .region import Region
 from .system import Jacobians, System
 
-_MAX_CUTS = 40
-"""Largest number of cuts of a region by branch and bound."""
-
 _TRIAL_CUTS, _MIN_GAIN = 8, 1e-3
 """Cutting stops after the trial cuts unless they reduced the bound by this fraction."""
 
@@ -122,7 +119,7 @@ class Subdivision:
             return value
         order = itertools.count()
         queue = [(-value, next(order), self.region)]
-        for cut in range(_MAX_CUTS):
+        for cut in range(self.system.max_cuts):
             worst, _, piece = queue[0]
             if cut == _TRIAL_CUTS and -worst > (1.0 - _MIN_GAIN) * value:
                 break

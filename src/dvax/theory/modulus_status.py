@@ -158,7 +158,7 @@ def _unweighted_law(system: System, region: Region) -> UnweightedLaw | None:
         M = _minimum_of_weight(weight, system, region)
         if not M > 0:
             continue
-        unweighted = System(problem, system.x0, system.args)
+        unweighted = System(problem, system.x0, system.args, max_cuts=system.max_cuts)
         proved = moduli(unweighted, region)
         mu, method = proved.gamma
         if mu > 0:

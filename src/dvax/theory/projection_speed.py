@@ -28,6 +28,7 @@ from ..sets import (
     Simplex,
     Translated,
 )
+from ..sets._library import is_of_library, sets_in
 from ..spaces import AbstractSpace
 from ..spaces import Product as ProductSpace
 from .weights import flat_roots, full_weights
@@ -123,12 +124,7 @@ def describe(
 
 def rejects_empty(K: AbstractSet) -> bool:
     """Return whether the constructor of this set raises an error for an empty set."""
-    parts = [v for v in vars(K).values() if isinstance(v, AbstractSet)]
-    for group in vars(K).values():
-        if isinstance(group, tuple):
-            parts += [v for v in group if isinstance(v, AbstractSet)]
-    is_library_set = type(K).__module__.startswith("dvax.sets.")
-    return is_library_set and not isinstance(K, Intersection) and all(map(rejects_empty, parts))
+    return is_of_library(K) and not any(isinstance(part, Intersection) for part in sets_in(K))
 
 
 def speed_of(motion: Any) -> float:

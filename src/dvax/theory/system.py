@@ -14,6 +14,9 @@ from .blocks import Block, block, identity
 from .region import Region
 from .weights import roots
 
+_MAX_KEPT = 4096
+"""Largest number of regions whose derivatives are kept."""
+
 
 class Jacobians(NamedTuple):
     """∂f/∂x, ∂f/∂u, ∂h/∂x, ∂h/∂u over a region, in the norms of the spaces; None if too large for a
@@ -30,10 +33,13 @@ class System:
     """The data of a problem as matrices in the norms of its spaces.
 
     A, P and K belong to the parameter `args`; f and h as well, unless `varied`: then they take the
-    parameter as an argument.
+    parameter as an argument. `max_cuts`: the largest number of cuts of a region by branch and bound.
     """
 
-    def __init__(self, problem: Problem, x0: Tree, args: Any, varied: bool = False):
+    def __init__(
+        self, problem: Problem, x0: Tree, args: Any, varied: bool = False, max_cuts: int = 40
+    ):
+        self.max_cuts = max_cuts
         self.problem, self.args = problem, args
         self._cache: dict[bytes, Jacobians] = {}
         self.x0, self.u0 = x0, problem.zero_control(x0)
@@ -59,6 +65,8 @@ class System:
         pieces."""
         key = b"".join(end.tobytes() for v in region.leaves for end in v[:2])
         if key not in self._cache:
+            if len(self._cache) >= _MAX_KEPT:
+                self._cache.clear()
             self._cache[key] = self._at(region)
         return self._cache[key]
 

@@ -1,0 +1,267 @@
+"""Error bounds from constants that hold along a trajectory, piece by piece in time.
+
+Constants of the whole space may not exist, and those of a region around a whole trajectory are large:
+errors then seem to grow everywhere as fast as they do in the worst place. Here time is cut into pieces,
+and each piece has the constants of a tube around the trajectory on it.
+
+Let x_c be computed on [a, b] with an enclosed defect, and ‖x_c(a) − x(a)‖ ≤ B(a). `certificate` bounds
+‖x_c − x‖ up to b if the boxes that contain x_c, enlarged by this bound, lie in the tube. The next piece
+starts from x_c(b) with B(b). So x_c is a trajectory with a bound, whoever computed the solution that is
+to be bounded: its distance from x_c is added.
+
+Pieces with the same semigroup share one factor M (`continue_bound`): with L̃(s) of the piece that
+contains s, Gronwall's lemma for e^{−ωt}‖x_c − x‖ gives the factor e^{∫(ω + ML̃)}, which M multiplies
+once.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .. import _tree
+from .._tree import Tree
+from ..errors import input_error
+from ..evolution import ETD2RK, Solution, solve
+from ..evolution.results import is_success
+from ..problem import Problem
+from ..programs.slope import interval
+from .certificate import Bound, bound_by_constants, continue_bound
+from .constants import Constants
+from .modulus_status import modulus_statuses
+from .region import Region
+from .set_motion import set_motion
+from .status import Status, weakest
+from .system import System
+from .verify import constants_of, domain_of, response_box, search_box
+from .weights import full_weights
+
+_FIRST_PIECES = 32
+"""Number of pieces from which the search for their length starts."""
+
+_MAX_GROWTH = 0.25
+"""Largest product of the rate and the length of a piece. A shorter piece has a narrower tube."""
+
+_SHORTEST = 2.0**-14
+"""Shortest piece, as a part of the run."""
+
+_INNER_TIMES, _MAX_SAVED = 4, 12
+"""Number of times in a piece at which its bound is computed, and of saved times in it."""
+
+_FIRST_RADII = (0.1, 1e-2, 1e-3, 1e-4)
+"""Radii of the boxes around the initial state that are tried, relative to 1 + |x₀|."""
+
+_WIDENINGS = 4
+"""Number of widths of a tube that are tried."""
+
+_SHARPER, _LOOSEST, _TIGHTEST = 0.01, 1e-5, 1e-9
+"""Tolerance of x_c relative to that of the solution, and its limits."""
+
+
+class _Piece(NamedTuple):
+    """x_c on a piece of time, its bound there, and the smallest rate at which errors may grow."""
+
+    sol: Solution
+    bound: Bound
+    rate: float
+
+
+class _Row(NamedTuple):
+    """x_c and its response at a saved time with their bounds: those of `Bound`, in its order."""
+
+    x: Tree
+    u: Tree
+    bounds: tuple[Any, ...]
+
+
+def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
+    """Return the bound of a solution from constants along it. The arguments are checked.
+
+    **Raises:** `dvax.InputError` if the code of f and h proves no constants around the initial state.
+    """
+    ts = np.asarray(sol.ts, float)
+    t0, t1 = (float(sol.setup.setting[name]) for name in ("t0", "t1"))
+    end = float(ts[-1]) if ts[-1] > t0 else t1
+    tube = _Tube(problem, sol, t0, end)
+    before: _Piece | None = None
+    a, length, why = t0, (end - t0) / _FIRST_PIECES, ""
+    rows: list[_Row] = []
+    statuses: list[Status] = []
+    while a < end and not why:
+        left = ts[len(rows) :]
+        next_ones = np.unique(left)[:_MAX_SAVED]
+        b = min(a + length, end, next_ones[-1] if next_ones[-1] > a else end)
+        b = end if end - b < 1e-3 * length else b
+        # A saved time at t0 belongs to the first piece.
+        saved = left[: np.searchsorted(left, b, side="right")]
+        piece = tube.piece(a, b, saved, before, initial_error)
+        if b - a > _SHORTEST * (end - t0) and (
+            isinstance(piece, str) or piece.rate * (b - a) > _MAX_GROWTH
+        ):
+            length = 0.5 * (b - a)
+            continue
+        if isinstance(piece, str):
+            why = f"{piece}, from t = {a:.6g} to t = {b:.6g}"
+            break
+        if piece.rate * length < 0.25 * _MAX_GROWTH:
+            length = min(2.0 * length, (end - t0) / 8)
+        rows += _rows(piece, saved)
+        statuses.append(piece.bound.status)
+        a, before = b, piece
+    return _assembled(problem, sol, rows, statuses, why)
+
+
+class _Tube:
+    """Tubes around x_c, and its pieces."""
+
+    def __init__(self, problem: Problem, sol: Solution, t0: float, end: float):
+        setup = sol.setup
+        self.problem, self.args, self.x0 = problem, setup.args, setup.x0
+        self.t0, self.span = t0, end - t0
+        # A tube is narrow: to cut it would gain little.
+        self.system = System(problem, setup.x0, setup.args, max_cuts=0)
+        knots = np.asarray(problem.knots(t0, end, setup.x0, setup.args), float)
+        self.possible = response_box(self.system, set_motion(self.system, t0, end, knots))
+        adaptive = np.isnan(float(setup.setting["dt"]))
+        rtol, atol = (float(setup.setting[name]) for name in ("rtol", "atol"))
+        least = max(_TIGHTEST, 200.0 * float(jnp.finfo(setup.dtype).eps))
+        sharper = _SHARPER * (rtol if adaptive else 1e-6)
+        self.rtol = float(np.clip(sharper, least, max(least, _LOOSEST)))
+        self.atol = _SHARPER * atol if adaptive else self.rtol
+        weights = full_weights(problem.spaces(setup.x0)[0], setup.x0)
+        self.weights = jtu.tree_map(lambda w: np.asarray(w, float), weights)
+        self.first = self._first_constants(t0, end)
+
+    def _first_constants(self, t0: float, end: float) -> Constants:
+        """Return constants around the initial state, for the tolerance of laws that are iterated."""
+        found: Constants | str = ""
+        for radius in _FIRST_RADII:
+            x0 = jtu.tree_map(lambda v: np.asarray(v, float), self.x0)
+            around = jtu.tree_map(lambda v, r=radius: r * (1.0 + np.abs(v)), x0)
+            found = self.constants(t0, end, *_widened(x0, x0, around))
+            if isinstance(found, Constants):
+                return found
+        raise input_error(
+            "dvax.bound_error(constants)", "None",
+            f"without constants, they are proved along the trajectory: {found}",
+            "Pass dvax.verify(problem, x0, x=(low, high), declared={…}).constants",
+        )  # fmt: skip
+
+    def constants(self, a: float, b: float, low: Tree, high: Tree) -> Constants | str:
+        """Return the constants for a ≤ t ≤ b and low ≤ x ≤ high, or why there are none."""
+        time = interval(a, b)
+        states = jtu.tree_map(interval, low, high)
+        region = Region(time, states, self.possible)
+        box = Region(time, states, search_box(self.possible, self.system.u0))
+        moduli = modulus_statuses(self.system, region, box, {})
+        for name, entry in moduli.by_name.items():
+            if entry.status != "proved":
+                return f"{name} is {entry.status}: {entry.reason}"
+        domain = domain_of(time, states, None, self.args, self.problem)
+        found = constants_of(self.system, region, moduli, domain)
+        return "γ is not positive, or a modulus is infinite" if found is None else found
+
+    def piece(
+        self, a: float, b: float, saved: np.ndarray, before: _Piece | None, initial_error: float
+    ) -> _Piece | str:
+        """Return x_c on [a, b] with its bound, or why there is none."""
+        inner = np.linspace(a, b, _INNER_TIMES + 1)[1:]
+        times = np.unique(np.concatenate([inner, saved]))
+        times = np.pad(times, (0, _INNER_TIMES + _MAX_SAVED - len(times)), "edge")
+        x, error, step = self.x0, initial_error, None
+        if before is not None:
+            x = jtu.tree_map(lambda rows: rows[-1], before.sol.xs)
+            error = float(before.bound.x[-1])
+            step = min(float(before.sol.stats["next_dt"]), b - a)
+        sol = solve(
+            self.problem, x, a, b, self.args, times, rtol=self.rtol, atol=self.atol,
+            method=ETD2RK(), constants=self.first, dt0=step, horizon=self.span, throw=False,
+        )  # fmt: skip
+        if not bool(is_success(sol.result)) or sol.bounds is None:
+            return "the trajectory beside it could not be computed"
+        low, high = (
+            jtu.tree_map(lambda rows: np.asarray(rows[-1], float), v) for v in sol.bounds.x
+        )
+        why = "an entry of the trajectory has no bound"
+        if not _tree.has_only_finite((low, high)):
+            return why
+        for k in range(_WIDENINGS):
+            wider = self._margin(low, high, error, 4.0**k)
+            constants = self.constants(a, b, *_widened(low, high, wider))
+            if isinstance(constants, str):
+                return constants
+            bound = self._bounded(sol, constants, before, error)
+            if np.isfinite(bound.x).all():
+                rates = [constants.growth_rate, constants.one_sided]
+                rate = min(float(v) for v in rates if v is not None)
+                return _Piece(sol, bound, rate)
+            why = bound.why
+        return why
+
+    def _margin(self, low: Tree, high: Tree, error: float, factor: float) -> Tree:
+        """Return how much wider than the boxes of x_c a tube is, if the bound is `error` at first."""
+        ends = [jtu.tree_leaves(tree) for tree in (low, high, self.weights)]
+        squares = (np.sum(w * np.maximum(np.abs(v), np.abs(z)) ** 2) for v, z, w in zip(*ends))
+        size = np.sqrt(sum(map(np.sum, ends[2])))
+        own = self.atol * size + self.rtol * np.sqrt(sum(squares))
+        reach = factor * (2.0 * error + 4.0 * own)
+        return jtu.tree_map(
+            lambda v, z, w: 0.02 * (z - v) + reach / np.sqrt(w), low, high, self.weights
+        )
+
+    def _bounded(
+        self, sol: Solution, constants: Constants, before: _Piece | None, error: float
+    ) -> Bound:
+        if before is None or float(constants.M) == 1.0:
+            return bound_by_constants(self.problem, sol, constants, error)
+        same_rates = (before.bound.x_sharp is None) == (constants.one_sided is None)
+        if same_rates:
+            return continue_bound(self.problem, sol, constants, before.bound)
+        return bound_by_constants(self.problem, sol, constants, before.bound)
+
+
+def _widened(low: Tree, high: Tree, margin: Tree) -> tuple[Tree, Tree]:
+    return jtu.tree_map(np.subtract, low, margin), jtu.tree_map(np.add, high, margin)
+
+
+def _rows(piece: _Piece, saved: np.ndarray) -> list[_Row]:
+    """Return the rows of a piece at the saved times in it."""
+    at = np.searchsorted(np.asarray(piece.sol.ts, float), saved)
+    bound = piece.bound
+    x_sharp = bound.x if bound.x_sharp is None else bound.x_sharp
+    u_sharp = bound.u if bound.u_sharp is None else bound.u_sharp
+    columns = (bound.x, bound.u, bound.x_paper, bound.u_paper, x_sharp, u_sharp)
+    row = lambda k: lambda rows: np.asarray(rows)[k]  # noqa: E731
+    return [
+        _Row(
+            jtu.tree_map(row(k), piece.sol.xs),
+            jtu.tree_map(row(k), piece.sol.us),
+            tuple(float(column[k]) for column in columns),
+        )
+        for k in at
+    ]
+
+
+def _assembled(
+    problem: Problem, sol: Solution, rows: list[_Row], statuses: list[Status], why: str
+) -> Bound:
+    """Return the bounds of x_c with the distance of the solution from it, infinite after the rows."""
+    count, found = len(sol.ts), len(rows)
+    bounds = np.full((6, count), np.inf)
+    if rows:
+        state, control = problem.spaces(sol.setup.x0)
+        stacked = lambda name: jtu.tree_map(  # noqa: E731
+            lambda *leaves: jnp.asarray(np.stack(leaves)), *(getattr(row, name) for row in rows)
+        )
+        first = lambda tree: jtu.tree_map(lambda leaf: leaf[:found], tree)  # noqa: E731
+        of_x = jax.vmap(state.norm)(_tree.sub(first(sol.xs), stacked("x")))
+        of_u = jax.vmap(control.norm)(_tree.sub(first(sol.us), stacked("u")))
+        distances = np.stack([np.asarray(of_x), np.asarray(of_u)] * 3)
+        bounds[:, :found] = np.array([row.bounds for row in rows]).T + distances
+    x, u, x_paper, u_paper, x_sharp, u_sharp = (jnp.asarray(v, sol.ts.dtype) for v in bounds)
+    return Bound(
+        sol.ts, x, u, x_paper, u_paper, x_sharp, u_sharp, weakest(*statuses) if statuses else
+        "estimated", None, why,
+    )  # fmt: skip

@@ -1,0 +1,230 @@
+"""Bounds without constants: proved along the trajectory, above the true error, and close to it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.selection import mostly_thorough
+
+import dvax
+
+LINE, PLANE = dvax.spaces.Euclidean(()), dvax.spaces.Euclidean(2)
+
+
+def problem(f, h, K, A=None, control=LINE, **more):
+    A = dvax.generators.Scalar(0.0) if A is None else A
+    return dvax.Problem(
+        A=A, P=dvax.operators.Scaling(1.0), K=K, f=f, h=h, control_space=control, **more
+    )
+
+
+def van_der_pol(mu):
+    return problem(
+        lambda t, x, u, args: jnp.stack([x[1], mu * (1.0 - x[0] ** 2) * x[1] - x[0] + u]),
+        lambda t, x, u, args: -x[1], dvax.sets.Box(-0.5, 0.5),
+    ), jnp.array([1.0, 0.0])  # fmt: skip
+
+
+def pendulum(gain):
+    return problem(
+        lambda t, x, u, args: jnp.stack([x[1], -4.0 * jnp.sin(x[0]) + u]),
+        lambda t, x, u, args: gain * (jnp.pi - x[0]) - x[1] - u, dvax.sets.Box(-1.0, 1.0),
+    ), jnp.array([2.0, 0.0])  # fmt: skip
+
+
+def fishery(price):
+    """Prey and predator; the catch of predators grows with their number, up to a quota that moves."""
+    return problem(
+        lambda t, x, u, args: jnp.stack(
+            [x[0] * (1.5 - x[0] - 0.6 * x[1]), x[1] * (0.8 * x[0] - 0.4 - u)]
+        ),
+        lambda t, x, u, args: price * (x[1] - 0.8),
+        lambda t, args: dvax.sets.Box(0.0, 1.0 + 0.5 * jnp.sin(t)),
+    ), jnp.array([0.5, 0.5])  # fmt: skip
+
+
+def lorenz(limit):
+    return problem(
+        lambda t, x, u, args: jnp.stack(
+            [10.0 * (x[1] - x[0]), x[0] * (28.0 - x[2]) - x[1] + u, x[0] * x[1] - 8.0 / 3.0 * x[2]]
+        ),
+        lambda t, x, u, args: -x[1], dvax.sets.Box(-limit, limit),
+    ), jnp.array([1.0, 1.0, 20.0])  # fmt: skip
+
+
+def reaction(rate):
+    """A hot reactor (Arrhenius) whose cooling is limited."""
+    return problem(
+        lambda t, x, u, args: jnp.stack(
+            [1.0 - x[0] - rate * x[0] * jnp.exp(-5.0 / x[1]),
+             1.0 - x[1] + 2.0 * rate * x[0] * jnp.exp(-5.0 / x[1]) - u]
+        ),
+        lambda t, x, u, args: 3.0 * (x[1] - 1.4), dvax.sets.Box(0.0, 0.6),
+    ), jnp.array([0.8, 1.1])  # fmt: skip
+
+
+def two_controls(pull):
+    return problem(
+        lambda t, x, u, args: jnp.stack([-x[1] * x[0] + u[0], x[0] ** 2 - 2.0 * x[1] + u[1]]),
+        lambda t, x, u, args: -pull * x + 0.2 * jnp.stack([x[0] * x[1], x[1]]) - 0.5 * u,
+        dvax.sets.Ball(0.0, 0.3), control=PLANE,
+    ), jnp.array([1.0, -0.2])  # fmt: skip
+
+
+def sheared(rate):
+    """A generator whose semigroup grows before it decays, M > 1 in this space."""
+    return problem(
+        lambda t, x, u, args: 0.1 * jnp.stack([jnp.sin(x[1]), x[0] * x[1]]) + jnp.stack([0.0, 1.0]) * u,
+        lambda t, x, u, args: -x[1], dvax.sets.Box(-0.2, 0.2),
+        A=dvax.generators.Dense(jnp.array([[-1.0, rate], [0.0, -1.5]])),
+    ), jnp.array([0.5, 1.0])  # fmt: skip
+
+
+def grid(n):
+    """Heat with a reaction x − x³ and heaters with limits."""
+    A = dvax.generators.Elliptic(n, 1.0, boundary="dirichlet", diffusion=0.05)
+    space = dvax.spaces.L2(jnp.full(n, 1.0 / n))
+    return dvax.Problem(
+        A=A, P=dvax.operators.Scaling(1.0),
+        K=dvax.sets.Box(-0.2, 0.2), f=lambda t, x, u, args: x - x**3 + u,
+        h=lambda t, x, u, args: -2.0 * x, state_space=space, control_space=space,
+    ), 1.5 * jnp.sin(jnp.pi * (jnp.arange(float(n)) + 0.5) / n)  # fmt: skip
+
+
+FAMILIES = {
+    van_der_pol: (0.1, 1.0, 4.0), pendulum: (0.5, 3.0), fishery: (0.5, 4.0), lorenz: (0.0, 30.0),
+    reaction: (5.0, 20.0), two_controls: (0.5, 2.0), sheared: (1.0, 10.0),
+}  # fmt: skip
+SPANS = {lorenz: 1.5}
+METHODS = (None, dvax.ETD2RK(), dvax.ExpRosenbrock(), dvax.Implicit())
+CASES = [
+    (family, value, method)
+    for family, values in FAMILIES.items()
+    for value in values
+    for method in METHODS
+]
+ALWAYS = {(van_der_pol, 1.0, None), (fishery, 4.0, None), (pendulum, 3.0, None)}
+
+
+def largest_ratio(system, x0, span, tol, method, count=40, **more):
+    """Check the bound against a tight run; return the largest bound over the largest error."""
+    ts = np.linspace(0.0, span, count + 1)[1:]
+    sharp = dict(rtol=1e-12, atol=1e-12, method=dvax.ExpRosenbrock())
+    exact = dvax.solve(system, x0, 0.0, span, ts=ts, **sharp)
+    sol = dvax.solve(system, x0, 0.0, span, ts=ts, rtol=tol, atol=tol, method=method, **more)
+    bound = dvax.bound_error(system, sol)
+    state, control = system.spaces(x0)
+    of_x = np.asarray(jax.vmap(state.norm)(sol.xs - exact.xs))
+    of_u = np.asarray(jax.vmap(control.norm)(sol.us - exact.us))
+    slack = 1e-10  # of the reference
+    assert (of_x <= np.asarray(bound.x) + slack).all() and (
+        of_u <= np.asarray(bound.u) + slack
+    ).all()
+    assert np.isfinite(bound.x).all(), bound
+    # A law that is iterated has a sampled defect.
+    assert bound.status == ("estimated" if isinstance(system.K, dvax.sets.Ball) else "proved"), (
+        bound
+    )
+    return float(np.max(np.asarray(bound.x))) / max(float(np.max(of_x)), tol)
+
+
+# Largest bound over the largest error, or over the tolerance if that is larger.
+CLOSE = {van_der_pol: 10.0, pendulum: 10.0, fishery: 10.0, lorenz: 30.0, reaction: 10.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("family", "value", "method"), mostly_thorough(CASES, ALWAYS))
+def test_bound_without_constants_is_above_the_error_and_of_its_size(family, value, method):
+    system, x0 = family(value)
+    ratio = largest_ratio(system, x0, SPANS.get(family, 5.0), 1e-6, method)
+    if (family, value) != (van_der_pol, 4.0):
+        assert ratio <= CLOSE.get(family, np.inf)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("tol", [1e-3, 1e-5, 1e-8])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_bounds_hold_at_other_tolerances(family, tol):
+    system, x0 = family(FAMILIES[family][0])
+    largest_ratio(system, x0, SPANS.get(family, 5.0), tol, None)
+
+
+@pytest.mark.slow
+def test_heat_with_a_reaction_in_its_weighted_space():
+    system, x0 = grid(24)
+    assert largest_ratio(system, x0, 2.0, 1e-6, None) <= 10.0
+
+
+@pytest.mark.slow
+def test_states_in_parts_initial_errors_and_many_saved_times():
+    system = dvax.Problem(
+        A=dvax.generators.Product(dvax.generators.Scalar(-1.0), dvax.generators.Scalar(0.0)),
+        P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, args: (args * jnp.sin(x[1]), x[0] * jnp.cos(x[1]) + u),
+        h=lambda t, x, u, args: -jnp.sum(x[1]), control_space=LINE,
+    )  # fmt: skip
+    x0, ts = (
+        (jnp.array([0.5, -0.2]), jnp.array([1.0, 2.0])),
+        np.sort(np.repeat(np.linspace(0, 2, 40), 3)),
+    )
+    sol = dvax.solve(system, x0, 0.0, 2.0, 1.5, ts, rtol=1e-4)
+    exact = dvax.solve(system, x0, 0.0, 2.0, 1.5, ts, rtol=1e-12, atol=1e-12)
+    space = system.spaces(x0)[0]
+    error = np.asarray(
+        jax.vmap(lambda a, b: space.norm((a[0] - b[0], a[1] - b[1])))(sol.xs, exact.xs)
+    )
+    bound = dvax.bound_error(system, sol)
+    assert bound.x.shape == (120,) and (error <= np.asarray(bound.x)).all()
+    # A trajectory that starts 1e-3 away is within the bound of this initial error.
+    other = dvax.solve(system, (x0[0] + 1e-3, x0[1]), 0.0, 2.0, 1.5, ts, rtol=1e-12, atol=1e-12)
+    moved = dvax.bound_error(system, sol, initial_error=1.5e-3)
+    apart = np.asarray(
+        jax.vmap(lambda a, b: space.norm((a[0] - b[0], a[1] - b[1])))(sol.xs, other.xs)
+    )
+    assert (apart <= np.asarray(moved.x)).all() and float(moved.x[0]) >= 1.5e-3
+    # And a run that continues has the bound of both.
+    first = dvax.solve(system, x0, 0.0, 1.0, 1.5, [1.0], rtol=1e-4)
+    second = dvax.solve(
+        system, jax.tree.map(lambda v: v[-1], first.xs), 1.0, 2.0, 1.5, [2.0], rtol=1e-4
+    )
+    both = dvax.bound_error(system, second, initial_error=dvax.bound_error(system, first))
+    end = jax.tree.map(lambda a, b: a[-1] - b[-1], second.xs, exact.xs)
+    assert float(space.norm(end)) <= float(both.x[-1]) <= 1e-2
+
+
+@pytest.mark.slow
+def test_a_bound_in_single_precision():
+    system, x0 = van_der_pol(1.0)
+    sol = dvax.solve(system, x0.astype(jnp.float32), 0.0, 3.0, ts=[1.0, 2.0, 3.0], rtol=1e-4)
+    exact = dvax.solve(system, x0, 0.0, 3.0, ts=[1.0, 2.0, 3.0], rtol=1e-12, atol=1e-12)
+    with jax.numpy_dtype_promotion("standard"):  # the constants are proved in double precision
+        bound = dvax.bound_error(system, sol)
+    error = np.linalg.norm(np.asarray(sol.xs, float) - np.asarray(exact.xs), axis=1)
+    assert bound.x.dtype == jnp.float32 and (error <= np.asarray(bound.x, float)).all()
+
+
+@pytest.mark.slow
+def test_where_no_tube_holds_the_bound_is_infinite_and_says_why():
+    """The solution 1/(1 − t) of x' = x² leaves every region before t = 1."""
+    system = problem(
+        lambda t, x, u, args: x**2 + 0.0 * u, lambda t, x, u, args: -x, dvax.sets.Box(-1.0, 1.0)
+    )
+    ts = np.array([0.5, 0.9, 0.999999])
+    sol = dvax.solve(system, 1.0, 0.0, 0.999999, ts=ts, rtol=1e-3)
+    bound = dvax.bound_error(system, sol)
+    assert np.isfinite(bound.x[0]) and abs(2.0 - float(sol.xs[0])) <= float(bound.x[0])
+    assert np.isinf(bound.x[-1]) and "from t = 0.99" in bound.why and bound.why in repr(bound)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_proved_is_refused():
+    opaque = problem(
+        lambda t, x, u, args: jnp.fft.irfft(jnp.fft.rfft(x) ** 2, 4) + u,
+        lambda t, x, u, args: -x, dvax.sets.Box(-1.0, 1.0), control=dvax.spaces.Euclidean(4),
+    )  # fmt: skip
+    sol = dvax.solve(opaque, jnp.full(4, 0.1), 0.0, 0.1)
+    with pytest.raises(dvax.InputError, match="proved along the trajectory: .* is estimated"):
+        dvax.bound_error(opaque, sol)
+    system, x0 = van_der_pol(1.0)
+    with pytest.raises(dvax.InputError, match="values, which are traced"):
+        jax.jit(lambda x: dvax.bound_error(system, dvax.solve(system, x, 0.0, 1.0)).x)(x0)
