@@ -405,9 +405,9 @@ VERIFY = {
         lambda: dvax.bound_error(PLAIN, None, verify().constants),
         "bound_error(sol); NoneType; the result of dvax.solve",
     ),
-    "bound without constants": (
-        lambda: dvax.bound_error(PLAIN, solve(), None),
-        "bound_error(constants); NoneType; dvax.verify(problem, x0).constants",
+    "bound with a verification": (
+        lambda: dvax.bound_error(PLAIN, solve(), verify()),
+        "bound_error(constants); Verification; dvax.verify(problem, x0).constants",
     ),
     "parameters, t0 text": (lambda: dvax.parameter_bounds(PLAIN, 0.0, 1.0, t0="a"), "'a'"),
 }

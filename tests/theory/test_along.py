@@ -43,6 +43,14 @@ def fishery(price):
     ), jnp.array([0.5, 0.5])  # fmt: skip
 
 
+def harvest(price):
+    """A catch without a quota: f is as steep in x as u is large."""
+    return problem(
+        lambda t, x, u, args: jnp.stack([x[0] * (1.5 - x[0]) - u * x[0], -0.3 * x[1] + u * x[0]]),
+        lambda t, x, u, args: price * (x[0] - 0.5), dvax.sets.Box(0.0, jnp.inf),
+    ), jnp.array([1.4, 0.0])  # fmt: skip
+
+
 def lorenz(limit):
     return problem(
         lambda t, x, u, args: jnp.stack(
@@ -93,7 +101,7 @@ def grid(n):
 
 FAMILIES = {
     van_der_pol: (0.1, 1.0, 4.0), pendulum: (0.5, 3.0), fishery: (0.5, 4.0), lorenz: (0.0, 30.0),
-    reaction: (5.0, 20.0), two_controls: (0.5, 2.0), sheared: (1.0, 10.0),
+    reaction: (5.0, 20.0), harvest: (0.5, 5.0), two_controls: (0.5, 2.0), sheared: (1.0, 10.0),
 }  # fmt: skip
 SPANS = {lorenz: 1.5}
 METHODS = (None, dvax.ETD2RK(), dvax.ExpRosenbrock(), dvax.Implicit())
@@ -103,7 +111,8 @@ CASES = [
     for value in values
     for method in METHODS
 ]
-ALWAYS = {(van_der_pol, 1.0, None), (fishery, 4.0, None), (pendulum, 3.0, None)}
+ALWAYS = {(van_der_pol, 1.0, None), (fishery, 4.0, None), (pendulum, 3.0, None),
+          (harvest, 5.0, None)}  # fmt: skip
 
 
 def largest_ratio(system, x0, span, tol, method, count=40, **more):
@@ -129,7 +138,14 @@ def largest_ratio(system, x0, span, tol, method, count=40, **more):
 
 
 # Largest bound over the largest error, or over the tolerance if that is larger.
-CLOSE = {van_der_pol: 10.0, pendulum: 10.0, fishery: 10.0, lorenz: 30.0, reaction: 10.0}
+CLOSE = {
+    van_der_pol: 10.0,
+    harvest: 10.0,
+    pendulum: 10.0,
+    fishery: 10.0,
+    lorenz: 30.0,
+    reaction: 10.0,
+}
 
 
 @pytest.mark.slow

@@ -31,11 +31,19 @@ from ..programs.slope import interval
 from .certificate import Bound, bound_by_constants, continue_bound
 from .constants import Constants
 from .modulus_status import modulus_statuses
+from .projection_speed import slopes
 from .region import Region
 from .set_motion import set_motion
 from .status import Status, weakest
 from .system import System
-from .verify import constants_of, domain_of, response_box, search_box
+from .verify import (
+    constants_of,
+    domain_of,
+    intersect,
+    response_box,
+    search_box,
+    without_limits,
+)
 from .weights import full_weights
 
 _FIRST_PIECES = 32
@@ -132,15 +140,25 @@ class _Tube:
         self.atol = _SHARPER * atol if adaptive else self.rtol
         weights = full_weights(problem.spaces(setup.x0)[0], setup.x0)
         self.weights = jtu.tree_map(lambda w: np.asarray(w, float), weights)
-        self.first = self._first_constants(t0, end)
+        self.is_unbounded = any(
+            bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
+        )
+        self.first = self._first_constants(t0, end, sol.us)
 
-    def _first_constants(self, t0: float, end: float) -> Constants:
-        """Return constants around the initial state, for the tolerance of laws that are iterated."""
+    def _first_constants(self, t0: float, end: float, us: Tree) -> Constants:
+        """Return constants around the initial state and the responses `us`, for the tolerance of laws
+        that are iterated."""
         found: Constants | str = ""
+        u = tuple(
+            jtu.tree_map(lambda rows, f=f: f(np.asarray(rows, float), axis=0), us)
+            for f in (np.min, np.max)
+        )
         for radius in _FIRST_RADII:
             x0 = jtu.tree_map(lambda v: np.asarray(v, float), self.x0)
             around = jtu.tree_map(lambda v, r=radius: r * (1.0 + np.abs(v)), x0)
             found = self.constants(t0, end, *_widened(x0, x0, around))
+            if isinstance(found, str) and self.is_unbounded:
+                found = self.constants(t0, end, *_widened(x0, x0, around), self._near(u, radius))
             if isinstance(found, Constants):
                 return found
         raise input_error(
@@ -149,19 +167,33 @@ class _Tube:
             "Pass dvax.verify(problem, x0, x=(low, high), declared={…}).constants",
         )  # fmt: skip
 
-    def constants(self, a: float, b: float, low: Tree, high: Tree) -> Constants | str:
-        """Return the constants for a ≤ t ≤ b and low ≤ x ≤ high, or why there are none."""
-        time = interval(a, b)
-        states = jtu.tree_map(interval, low, high)
-        region = Region(time, states, self.possible)
-        box = Region(time, states, search_box(self.possible, self.system.u0))
+    def constants(
+        self, a: float, b: float, low: Tree, high: Tree, u: tuple[Tree, Tree] | None = None
+    ) -> Constants | str:
+        """Return the constants for a ≤ t ≤ b and low ≤ x ≤ high, and for u between these bounds where
+        they are given, or why there are none."""
+        time, states = interval(a, b), jtu.tree_map(interval, low, high)
+        responses, limits = self.possible, None
+        if u is not None:
+            given = jtu.tree_map(interval, *u)
+            responses = intersect(given, self.possible)
+            limits = without_limits(given, self.possible)
+        region = Region(time, states, responses)
+        box = Region(time, states, search_box(responses, self.system.u0))
         moduli = modulus_statuses(self.system, region, box, {})
         for name, entry in moduli.by_name.items():
             if entry.status != "proved":
                 return f"{name} is {entry.status}: {entry.reason}"
-        domain = domain_of(time, states, None, self.args, self.problem)
+        domain = domain_of(time, states, limits, self.args, self.problem)
         found = constants_of(self.system, region, moduli, domain)
         return "γ is not positive, or a modulus is infinite" if found is None else found
+
+    def _near(self, u: tuple[Tree, Tree], margin: float) -> tuple[Tree, Tree]:
+        """Return bounds of u that are wider by a part of its size, inside those of the set."""
+        wider = jtu.tree_map(
+            lambda v, w: 0.1 * (w - v) + margin * (1.0 + np.maximum(np.abs(v), np.abs(w))), *u
+        )
+        return _widened(*u, wider)
 
     def piece(
         self, a: float, b: float, saved: np.ndarray, before: _Piece | None, initial_error: float
@@ -181,15 +213,21 @@ class _Tube:
         )  # fmt: skip
         if not bool(is_success(sol.result)) or sol.bounds is None:
             return "the trajectory beside it could not be computed"
-        low, high = (
-            jtu.tree_map(lambda rows: np.asarray(rows[-1], float), v) for v in sol.bounds.x
+        (low, high), u = (
+            tuple(jtu.tree_map(lambda rows: np.asarray(rows[-1], float), v) for v in ends)
+            for ends in sol.bounds
         )
         why = "an entry of the trajectory has no bound"
-        if not _tree.has_only_finite((low, high)):
+        if not _tree.has_only_finite((low, high, u)):
             return why
         for k in range(_WIDENINGS):
             wider = self._margin(low, high, error, 4.0**k)
             constants = self.constants(a, b, *_widened(low, high, wider))
+            if isinstance(constants, str) and self.is_unbounded:
+                # f may be steep in a u that is large, and u is not.
+                constants = self.constants(
+                    a, b, *_widened(low, high, wider), self._near(u, 0.02 * 2**k)
+                )
             if isinstance(constants, str):
                 return constants
             bound = self._bounded(sol, constants, before, error)
