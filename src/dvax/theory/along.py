@@ -55,7 +55,7 @@ _MAX_GROWTH = 0.25
 _SHORTEST = 2.0**-14
 """Shortest piece, as a part of the run."""
 
-_INNER_TIMES, _MAX_SAVED = 4, 12
+_INNER_TIMES, _MAX_SAVED = 4, 60
 """Number of times in a piece at which its bound is computed, and of saved times in it."""
 
 _FIRST_RADII = (0.1, 1e-2, 1e-3, 1e-4)
