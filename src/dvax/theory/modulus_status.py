@@ -54,10 +54,11 @@ class ModulusStatuses(NamedTuple):
 
 
 def modulus_statuses(
-    system: System, region: Region, box: Region, declared: dict[str, float]
+    system: System, region: Region, box: Region | None, declared: dict[str, float]
 ) -> ModulusStatuses:
     """Return every modulus over `region`: a proved value, or else the declared one, or else an estimate
-    from a search in the bounded `box`."""
+    from a search in the bounded `box`; without a box, the estimate is the value for which there is no
+    proof."""
     proved = moduli(system, region)
     by_name = {}
     for name, of, by in (
@@ -66,6 +67,9 @@ def modulus_statuses(
         value, method = getattr(proved, name)
         if np.isfinite(value):
             by_name[name] = ModulusStatus(value, "proved", method)
+        elif box is None:
+            why = _reason_without_proof(proved, of, method)
+            by_name[name] = ModulusStatus(value, "estimated", why)
         else:
             found = search_slope(system, box, of, by)
             why = _reason_without_proof(proved, of, method)
@@ -129,10 +133,12 @@ def _lipschitz_status(
 
 
 def _gamma_status(
-    system: System, gamma: float, reason: str, box: Region, declared: dict[str, float]
+    system: System, gamma: float, reason: str, box: Region | None, declared: dict[str, float]
 ) -> tuple[ModulusStatus, CounterexamplePair | None]:
     if gamma > 0:
         return ModulusStatus(gamma, "proved", reason), None
+    if box is None:
+        return ModulusStatus(gamma, "estimated", reason), None
     search = f"a search over {describe(box)}"
     pair = find_counterexample(system, box)
     if pair is not None:
