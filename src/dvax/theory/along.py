@@ -139,6 +139,7 @@ class _Tube:
         self.atol = _SHARPER * atol if adaptive else self.rtol
         weights = full_weights(problem.spaces(setup.x0)[0], setup.x0)
         self.weights = jtu.tree_map(lambda w: np.asarray(w, float), weights)
+        self.limits_u = False
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
         )
@@ -220,12 +221,12 @@ class _Tube:
             return why
         for k in range(_WIDENINGS):
             wider = self._margin(low, high, error, 4.0**k)
-            constants = self.constants(a, b, *_widened(low, high, wider))
-            if isinstance(constants, str) and self.is_unbounded:
+            box, near = _widened(low, high, wider), self._near(u, 0.02 * 2.0**k)
+            constants = self.constants(a, b, *box, near if self.limits_u else None)
+            if isinstance(constants, str) and self.is_unbounded and not self.limits_u:
                 # f may be steep in a u that is large, and u is not.
-                constants = self.constants(
-                    a, b, *_widened(low, high, wider), self._near(u, 0.02 * 2**k)
-                )
+                self.limits_u = True
+                constants = self.constants(a, b, *box, near)
             if isinstance(constants, str):
                 return constants
             bound = self._bounded(sol, constants, before, error)
