@@ -209,6 +209,21 @@ def test_states_in_parts_initial_errors_and_many_saved_times():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "ts",
+    [np.zeros(3), 1.0 - 1e-7 * np.arange(150.0)[::-1], np.linspace(0.0, 1.0, 200)],
+    ids=["at the start", "close to the end", "many"],
+)  # fmt: skip
+def test_any_saved_times_have_a_bound(ts):
+    system, x0 = van_der_pol(1.0)
+    sol = dvax.solve(system, x0, 0.0, 1.0, ts=ts)
+    exact = dvax.solve(system, x0, 0.0, 1.0, ts=ts, rtol=1e-12, atol=1e-12)
+    bound = dvax.bound_error(system, sol)
+    error = np.linalg.norm(np.asarray(sol.xs - exact.xs), axis=1)
+    assert (error <= np.asarray(bound.x) + 1e-11).all() and float(bound.x.max()) < 1e-5
+
+
+@pytest.mark.slow
 def test_a_bound_in_single_precision():
     system, x0 = van_der_pol(1.0)
     sol = dvax.solve(system, x0.astype(jnp.float32), 0.0, 3.0, ts=[1.0, 2.0, 3.0], rtol=1e-4)

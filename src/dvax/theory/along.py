@@ -24,7 +24,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import input_error
-from ..evolution import ETD2RK, Solution, solve
+from ..evolution import ETD2RK, RESULTS, Solution, solve
 from ..evolution.results import is_success
 from ..problem import Problem
 from ..programs.slope import interval
@@ -96,11 +96,13 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
     a, length, why = t0, (end - t0) / _FIRST_PIECES, ""
     rows: list[_Row] = []
     statuses: list[Status] = []
-    while a < end and not why:
+    while len(rows) < len(ts):
         left = ts[len(rows) :]
-        next_ones = np.unique(left)[:_MAX_SAVED]
-        b = min(a + length, end, next_ones[-1] if next_ones[-1] > a else end)
+        # More saved times than a piece has room for end it; one of them may be t0.
+        different = np.unique(left)
+        b = min(a + length, end)
         b = end if end - b < 1e-3 * length else b
+        b = min(b, different[_MAX_SAVED - 1]) if len(different) > _MAX_SAVED else b
         # A saved time at t0 belongs to the first piece.
         saved = left[: np.searchsorted(left, b, side="right")]
         piece = tube.piece(a, b, saved, before, initial_error)
@@ -126,7 +128,7 @@ class _Tube:
     def __init__(self, problem: Problem, sol: Solution, t0: float, end: float):
         setup = sol.setup
         self.problem, self.args, self.x0 = problem, setup.args, setup.x0
-        self.t0, self.span = t0, end - t0
+        self.span = end - t0
         # A tube is narrow: to cut it would gain little.
         self.system = System(problem, setup.x0, setup.args, max_cuts=0)
         knots = np.asarray(problem.knots(t0, end, setup.x0, setup.args), float)
@@ -210,8 +212,9 @@ class _Tube:
             self.problem, x, a, b, self.args, times, rtol=self.rtol, atol=self.atol,
             method=ETD2RK(), constants=self.first, dt0=step, horizon=self.span, throw=False,
         )  # fmt: skip
-        if not bool(is_success(sol.result)) or sol.bounds is None:
-            return "the trajectory beside it could not be computed"
+        if not bool(is_success(sol.result)):
+            return f"ETD2RK, whose defect is enclosed, fails: {RESULTS[sol.result]}"
+        assert sol.bounds is not None  # the constants are of a region
         (low, high), u = (
             tuple(jtu.tree_map(lambda rows: np.asarray(rows[-1], float), v) for v in ends)
             for ends in sol.bounds

@@ -26,8 +26,8 @@ def bound_error(
     **Without constants** they are proved along the trajectory, in tubes around pieces of it, from the
     code of f and h: no region has to be given, and errors grow in the bound as they do near the
     trajectory. The problem is solved once more for this, by `ETD2RK` with tolerances of 10⁻⁹ to 10⁻⁵,
-    and the distance of `sol` from this run is added: `sol` may be of any method. It takes some
-    hundredths of a second a piece, of which there are about four for each factor e of growth.
+    and the distance of `sol` from this run is added: `sol` may be of any method. There are about four
+    pieces for each factor e by which errors may grow.
 
     If the solve did not record its defect (fixed steps), or the bounds of its trajectory (for constants
     of a region that were not passed to it), the problem is solved again with the same steps, and the
