@@ -9,9 +9,15 @@ Let x_c be computed on [a, b] with an enclosed defect, and ‖x_c(a) − x(a)‖
 starts from x_c(b) with B(b). So x_c is a trajectory with a bound, whoever computed the solution that is
 to be bounded: its distance from x_c is added.
 
-Pieces with the same semigroup share one factor M (`continue_bound`): with L̃(s) of the piece that
-contains s, Gronwall's lemma for e^{−ωt}‖x_c − x‖ gives the factor e^{∫(ω + ML̃)}, which M multiplies
-once.
+The boxes of x_c, enlarged by this bound, contain both trajectories, and the derivatives over them say
+how errors propagate (`linearisation`): an ellipsoid that contains the error is mapped by e^{Ct}, and a
+ball for the defect and the rest is added. So over many pieces errors grow as the linearised equation
+lets them, in whatever norm the space has. Where the rest is large, as for a law at a kink, the bound by
+constants may be smaller, and the ellipsoid becomes a ball.
+
+Where no ellipsoid is known, pieces with the same semigroup share one factor M (`continue_bound`): with
+L̃(s) of the piece that contains s, Gronwall's lemma for e^{−ωt}‖x_c − x‖ gives the factor
+e^{∫(ω + ML̃)}, which M multiplies once.
 """
 
 from typing import Any, NamedTuple
@@ -28,8 +34,10 @@ from ..evolution import ETD2RK, RESULTS, Solution, solve
 from ..evolution.results import is_success
 from ..problem import Problem
 from ..programs.slope import interval
-from .certificate import Bound, bound_by_constants, continue_bound
+from .certificate import Bound, bound_by_constants, continue_bound, disturbances
 from .constants import Constants
+from .error_ellipsoid import ErrorEllipsoid, propagate
+from .linearisation import linearisation
 from .modulus_status import modulus_statuses
 from .projection_speed import slopes
 from .region import Region
@@ -51,6 +59,17 @@ _FIRST_PIECES = 32
 _MAX_GROWTH = 0.25
 """Largest product of the rate and the length of a piece. A shorter piece has a narrower tube."""
 
+_MAX_GROWTH_INSIDE = 4.0
+"""Largest such product where an ellipsoid is known, so that errors grow at this rate inside only."""
+
+_MAX_SHARE, _MAX_SUM = 0.01, 1.0
+"""Largest share of the rest of the linearisation in the error of a piece, and in that of the run, if it
+is proportional to the length of a piece. The larger one of both limits a piece."""
+
+_PATIENCE = 4
+"""Number of pieces with an unknown derivative of the law after which the next ones are as long as the
+growth by constants allows. A kink that is crossed takes fewer."""
+
 _SHORTEST = 2.0**-14
 """Shortest piece, as a part of the run."""
 
@@ -68,11 +87,25 @@ _SHARPER, _LOOSEST, _TIGHTEST = 0.01, 1e-5, 1e-9
 
 
 class _Piece(NamedTuple):
-    """x_c on a piece of time, its bound there, and the smallest rate at which errors may grow."""
+    """x_c on a piece of time; its bound by constants there, and the smallest rate of these; its best
+    bounds of x and u; the ellipsoid of the error at its end, with the share of the rest in it; and
+    whether the derivative of the law is known."""
 
     sol: Solution
     bound: Bound
     rate: float
+    x: np.ndarray
+    u: np.ndarray
+    ellipsoid: ErrorEllipsoid
+    share: float
+    knows_law: bool
+
+    def excess(self, length: float, span: float, impatient: bool) -> float:
+        """Return how much too long a piece of this length is in a run of this span, as a factor."""
+        growth = self.rate * length
+        limit = max(_MAX_SHARE, _MAX_SUM * length / span)
+        inside = max(growth / _MAX_GROWTH_INSIDE, self.share / limit)
+        return min(growth / _MAX_GROWTH, inside) if impatient else inside
 
 
 class _Row(NamedTuple):
@@ -94,6 +127,7 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
     tube = _Tube(problem, sol, t0, end)
     before: _Piece | None = None
     a, length, why = t0, (end - t0) / _FIRST_PIECES, ""
+    unknown = 0  # number of the last pieces with an unknown derivative of the law
     rows: list[_Row] = []
     statuses: list[Status] = []
     while len(rows) < len(ts):
@@ -106,15 +140,17 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
         # A saved time at t0 belongs to the first piece.
         saved = left[: np.searchsorted(left, b, side="right")]
         piece = tube.piece(a, b, saved, before, initial_error)
-        if b - a > _SHORTEST * (end - t0) and (
-            isinstance(piece, str) or piece.rate * (b - a) > _MAX_GROWTH
+        span, impatient = end - t0, unknown >= _PATIENCE
+        if b - a > _SHORTEST * span and (
+            isinstance(piece, str) or piece.excess(b - a, span, impatient) > 1.0
         ):
             length = 0.5 * (b - a)
             continue
         if isinstance(piece, str):
             why = f"{piece}, from t = {a:.6g} to t = {b:.6g}"
             break
-        if piece.rate * length < 0.25 * _MAX_GROWTH:
+        unknown = 0 if piece.knows_law else unknown + 1
+        if piece.excess(length, span, impatient) < 0.25:
             length = min(2.0 * length, (end - t0) / 8)
         rows += _rows(piece, saved)
         statuses.append(piece.bound.status)
@@ -139,8 +175,11 @@ class _Tube:
         sharper = _SHARPER * (rtol if adaptive else 1e-6)
         self.rtol = float(np.clip(sharper, least, max(least, _LOOSEST)))
         self.atol = _SHARPER * atol if adaptive else self.rtol
-        weights = full_weights(problem.spaces(setup.x0)[0], setup.x0)
-        self.weights = jtu.tree_map(lambda w: np.asarray(w, float), weights)
+        of_space = lambda space, like: jtu.tree_map(  # noqa: E731
+            lambda w: np.asarray(w, float), full_weights(space, like)
+        )
+        self.weights = of_space(self.system.state, setup.x0)
+        self.weights_u = of_space(self.system.control, self.system.u0)
         self.limits_u = False
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
@@ -206,7 +245,7 @@ class _Tube:
         x, error, step = self.x0, initial_error, None
         if before is not None:
             x = jtu.tree_map(lambda rows: rows[-1], before.sol.xs)
-            error = float(before.bound.x[-1])
+            error = float(before.x[-1])
             step = min(float(before.sol.stats["next_dt"]), b - a)
         sol = solve(
             self.problem, x, a, b, self.args, times, rtol=self.rtol, atol=self.atol,
@@ -234,11 +273,57 @@ class _Tube:
                 return constants
             bound = self._bounded(sol, constants, before, error)
             if np.isfinite(bound.x).all():
-                rates = [constants.growth_rate, constants.one_sided]
-                rate = min(float(v) for v in rates if v is not None)
-                return _Piece(sol, bound, rate)
+                n = sum(map(np.size, jtu.tree_leaves(x)))
+                start = ErrorEllipsoid.ball(error, n) if before is None else before.ellipsoid
+                return self._propagated(sol, constants, bound, start)
             why = bound.why
         return why
+
+    def _propagated(
+        self, sol: Solution, constants: Constants, bound: Bound, start: ErrorEllipsoid
+    ) -> _Piece:
+        """Return the piece with the smaller one of two bounds at each time: by constants, and by an
+        ellipsoid that starts as `start`."""
+        rates = [(float(constants.M), float(constants.growth_rate))]
+        if constants.one_sided is not None:
+            rates.append((1.0, float(constants.one_sided)))
+        rate = min(c for _, c in rates)
+        x, u = np.asarray(bound.x, float), np.asarray(bound.u, float)
+        times = np.asarray(sol.ts, float) - float(sol.setup.setting["t0"])
+        integral, of_x, of_law = disturbances(self.problem, sol, constants)
+        with np.errstate(over="ignore"):
+            growth = min(M * np.exp(max(c, 0.0) * times[-1]) for M, c in rates)
+        most, L = growth * (start.norm + integral[-1]), float(constants.L)
+        linear = None
+        if np.isfinite(most):
+            region = self._around(sol, most, L * most + float(np.max(of_law)))
+            linear = linearisation(self.system, region, L)
+        if linear is None:
+            ball = ErrorEllipsoid.ball(x[-1], len(start.B))
+            return _Piece(sol, bound, rate, x, u, ball, np.inf, False)
+        found = propagate(linear, start, times, integral, of_x)
+        x = np.fmin(x, found.bounds)
+        u = np.fmin(u, linear.gain * x + of_law)
+        ellipsoid = found.ellipsoid
+        if not ellipsoid.norm <= bound.x[-1]:
+            ellipsoid = ErrorEllipsoid.ball(x[-1], len(start.B))
+        return _Piece(sol, bound, rate, x, u, ellipsoid, found.share, linear.knows_law)
+
+    def _around(self, sol: Solution, of_x: float, of_u: float) -> Region:
+        """Return the region of both trajectories, whose distances have at most these norms."""
+        assert sol.bounds is not None
+        t0, t1 = (float(sol.setup.setting[name]) for name in ("t0", "t1"))
+        x, u = (
+            jtu.tree_map(
+                lambda low, high, w, d=d: interval(
+                    np.asarray(low[-1], float) - d / np.sqrt(w),
+                    np.asarray(high[-1], float) + d / np.sqrt(w),
+                ),
+                *ends, weights,
+            )
+            for ends, weights, d in zip(sol.bounds, (self.weights, self.weights_u), (of_x, of_u))
+        )  # fmt: skip
+        return Region(interval(t0, t1), x, intersect(u, self.possible))
 
     def _margin(self, low: Tree, high: Tree, error: float, factor: float) -> Tree:
         """Return how much wider than the boxes of x_c a tube is, if the bound is `error` at first."""
@@ -254,7 +339,8 @@ class _Tube:
     def _bounded(
         self, sol: Solution, constants: Constants, before: _Piece | None, error: float
     ) -> Bound:
-        if before is None or float(constants.M) == 1.0:
+        M = float(constants.M)
+        if before is None or M == 1.0 or M * error < float(before.bound.x[-1]):
             return bound_by_constants(self.problem, sol, constants, error)
         same_rates = (before.bound.x_sharp is None) == (constants.one_sided is None)
         if same_rates:
@@ -269,10 +355,8 @@ def _widened(low: Tree, high: Tree, margin: Tree) -> tuple[Tree, Tree]:
 def _rows(piece: _Piece, saved: np.ndarray) -> list[_Row]:
     """Return the rows of a piece at the saved times in it."""
     at = np.searchsorted(np.asarray(piece.sol.ts, float), saved)
-    bound = piece.bound
-    x_sharp = bound.x if bound.x_sharp is None else bound.x_sharp
-    u_sharp = bound.u if bound.u_sharp is None else bound.u_sharp
-    columns = (bound.x, bound.u, bound.x_paper, bound.u_paper, x_sharp, u_sharp)
+    x, u, bound = piece.x, piece.u, piece.bound
+    columns = (x, u, bound.x_paper, bound.u_paper, x, u)
     row = lambda k: lambda rows: np.asarray(rows)[k]  # noqa: E731
     return [
         _Row(

@@ -47,16 +47,16 @@ class Block(NamedTuple):
 
     def norm(self) -> float:
         """Return sup ‖·‖ over the enclosed matrices, with ‖Δ‖₂ ≤ ‖|Δ|‖₂ ≤ ‖radius‖₂."""
-        return float(np.max(_norms(self.center) + self.radius_norms(), initial=0.0))
+        return float(np.max(norms(self.center) + self.radius_norms(), initial=0.0))
 
     def radius_norms(self) -> Values:
         """Return ‖radius‖ of every matrix."""
-        return _norms(self.radius)
+        return norms(self.radius)
 
     def smallest_quotient(self) -> float:
         """Return inf ⟨Jd, d⟩/‖d‖², the smallest eigenvalue of the symmetric part."""
         sym = 0.5 * (self.center + self.center.swapaxes(1, 2))
-        radius = _norms(0.5 * (self.radius + self.radius.swapaxes(1, 2)))
+        radius = norms(0.5 * (self.radius + self.radius.swapaxes(1, 2)))
         return float(np.min(eigenvalues(sym)[:, 0] - radius, initial=np.inf))
 
 
@@ -161,7 +161,7 @@ def _dot(a: Values, b: Values) -> Values:
     return np.where(infinite > 0, np.inf, finite)
 
 
-def _norms(stack: Values) -> Values:
+def norms(stack: Values) -> Values:
     """Return ‖·‖₂ of every matrix."""
     if stack.shape[1:] == (1, 1):
         return np.abs(stack[:, 0, 0])

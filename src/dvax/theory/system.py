@@ -1,15 +1,17 @@
 """The data of a problem as matrices: the derivatives of f and h over a region, P⁻¹ and A."""
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from .._tree import Tree
 from ..problem import Problem
-from ..programs.slope import SlopeEnclosure, TooLarge, interval
+from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval
 from .blocks import Block, block, identity
 from .region import Region
 from .weights import roots
@@ -20,13 +22,14 @@ _MAX_KEPT = 4096
 
 class Jacobians(NamedTuple):
     """∂f/∂x, ∂f/∂u, ∂h/∂x, ∂h/∂u over a region, in the norms of the spaces; None if too large for a
-    matrix. `unknown`: the operations in f and in h that have no rule."""
+    matrix. `unknown`: the operations in f and in h that have no rule. `h`: the values of h."""
 
     f_x: Block | None
     f_u: Block | None
     h_x: Block | None
     h_u: Block | None
     unknown: dict[str, tuple[str, ...]]
+    h: Tree | None
 
 
 class System:
@@ -74,24 +77,41 @@ class System:
         parts = len(jtu.tree_leaves(self.x0))
         blocks: list[Block | None] = []
         unknown: dict[str, tuple[str, ...]] = {}
+        out: Tree | None = None
         for name, enclosure in (("f", self._f), ("h", self._h)):
             try:
                 out, unknown[name] = enclosure(*region)
             except TooLarge:
                 blocks += [None, None]
-                unknown[name] = ()
+                out, unknown[name] = None, ()
                 continue
             roots_out = self._roots_x if name == "f" else self._roots_u
             blocks.append(_block_or_none(out, 0, roots_out, self._roots_x))
             blocks.append(_block_or_none(out, parts, roots_out, self._roots_u))
         f_x, f_u, h_x, h_u = blocks
-        return Jacobians(f_x, f_u, h_x, h_u, unknown)
+        return Jacobians(f_x, f_u, h_x, h_u, unknown, out)
 
     def frozen(self, h_u: Block) -> Block:
         """Return ∂F/∂y = (I − ∂h/∂u) P⁻¹ (eq:F_def)."""
         if self.P_inv is None:
             raise TooLarge
         return identity(h_u).plus(h_u, -1.0) @ self.P_inv
+
+    def interval_bounds(self, time: Slope) -> tuple[Slope, Slope] | None:
+        """Return both ends of the intervals of K(t), entry by entry, or None if K is not a box."""
+        if self._intervals is None:
+            return None
+        low, high = self._intervals(time).out
+        return low, high
+
+    @cached_property
+    def _intervals(self) -> SlopeEnclosure | None:
+        def ends(t: Any) -> Any:
+            bounds = self.problem.set_at(t, self.args).intervals(self.u0)
+            return None if bounds is None else tuple(ravel_pytree(end)[0] for end in bounds)
+
+        time = jnp.zeros(())
+        return None if ends(time) is None else SlopeEnclosure(ends, (time,), ())
 
     def _of_linear(self, apply: Callable[[Tree], Tree], space: Any, like: Tree) -> Block | None:
         """Return the matrix of a linear map, or None if it is too large or has operations without a
