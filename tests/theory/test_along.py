@@ -89,8 +89,8 @@ def sheared(rate):
 
 
 def spring(stiffness):
-    """A mass on a spring, driven to a place by a force with limits. Errors turn: the rate in the norm of
-    this space is half the stiffness."""
+    """A mass on a spring, driven to a place by a force with limits. Errors turn: the rate in the norm
+    of this space is half the stiffness."""
     gain = 2.5 * stiffness
     return problem(
         lambda t, x, u, args: jnp.stack([0.0, 1.0]) * u,

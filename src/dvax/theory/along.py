@@ -37,7 +37,7 @@ from ..programs.slope import interval
 from .certificate import Bound, bound_by_constants, continue_bound, disturbances
 from .constants import Constants
 from .error_ellipsoid import ErrorEllipsoid, propagate
-from .linearisation import linearisation
+from .linearisation import MAX_UNKNOWNS, linearisation
 from .modulus_status import modulus_statuses
 from .projection_speed import slopes
 from .region import Region
@@ -59,9 +59,6 @@ _FIRST_PIECES = 32
 _MAX_GROWTH = 0.25
 """Largest product of the rate and the length of a piece. A shorter piece has a narrower tube."""
 
-_MAX_GROWTH_INSIDE = 4.0
-"""Largest such product where an ellipsoid is known, so that errors grow at this rate inside only."""
-
 _MAX_SHARE, _MAX_SUM = 0.01, 1.0
 """Largest share of the rest of the linearisation in the error of a piece, and in that of the run, if it
 is proportional to the length of a piece. The larger one of both limits a piece."""
@@ -72,6 +69,9 @@ growth by constants allows. A kink that is crossed takes fewer."""
 
 _SHORTEST = 2.0**-14
 """Shortest piece, as a part of the run."""
+
+_USELESS = 1e6
+"""Bound, relative to 1 + ‖x_c‖, that is not followed any further."""
 
 _INNER_TIMES, _MAX_SAVED = 4, 60
 """Number of times in a piece at which its bound is computed, and of saved times in it."""
@@ -96,16 +96,15 @@ class _Piece(NamedTuple):
     rate: float
     x: np.ndarray
     u: np.ndarray
-    ellipsoid: ErrorEllipsoid
+    ellipsoid: ErrorEllipsoid | None
     share: float
     knows_law: bool
 
     def excess(self, length: float, span: float, impatient: bool) -> float:
         """Return how much too long a piece of this length is in a run of this span, as a factor."""
-        growth = self.rate * length
-        limit = max(_MAX_SHARE, _MAX_SUM * length / span)
-        inside = max(growth / _MAX_GROWTH_INSIDE, self.share / limit)
-        return min(growth / _MAX_GROWTH, inside) if impatient else inside
+        of_rest = self.share / max(_MAX_SHARE, _MAX_SUM * length / span)
+        by_constants = self.ellipsoid is None or impatient
+        return min(self.rate * length / _MAX_GROWTH, of_rest) if by_constants else of_rest
 
 
 class _Row(NamedTuple):
@@ -127,6 +126,7 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
     tube = _Tube(problem, sol, t0, end)
     before: _Piece | None = None
     a, length, why = t0, (end - t0) / _FIRST_PIECES, ""
+    norm = jax.vmap(problem.spaces(sol.setup.x0)[0].norm)
     unknown = 0  # number of the last pieces with an unknown derivative of the law
     rows: list[_Row] = []
     statuses: list[Status] = []
@@ -148,6 +148,9 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
             continue
         if isinstance(piece, str):
             why = f"{piece}, from t = {a:.6g} to t = {b:.6g}"
+            break
+        if piece.x[-1] > _USELESS * (1.0 + float(norm(piece.sol.xs)[-1])):
+            why = f"at t = {b:.6g} it has grown to {_USELESS:.0g} times the solution"
             break
         unknown = 0 if piece.knows_law else unknown + 1
         if piece.excess(length, span, impatient) < 0.25:
@@ -180,7 +183,8 @@ class _Tube:
         )
         self.weights = of_space(self.system.state, setup.x0)
         self.weights_u = of_space(self.system.control, self.system.u0)
-        self.limits_u = False
+        self.size = sum(map(np.size, jtu.tree_leaves(setup.x0)))
+        self.limits_u, self.width = False, 1.0
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
         )
@@ -261,9 +265,10 @@ class _Tube:
         why = "an entry of the trajectory has no bound"
         if not _tree.has_only_finite((low, high, u)):
             return why
-        for k in range(_WIDENINGS):
-            wider = self._margin(low, high, error, 4.0**k)
-            box, near = _widened(low, high, wider), self._near(u, 0.02 * 2.0**k)
+        for _ in range(_WIDENINGS):
+            reach = self.width * self._least_reach(low, high, error)
+            box = _widened(low, high, self._margin(low, high, reach))
+            near = self._near(u, 0.02 * np.sqrt(self.width))
             constants = self.constants(a, b, *box, near if self.limits_u else None)
             if isinstance(constants, str) and self.is_unbounded and not self.limits_u:
                 # f may be steep in a u that is large, and u is not.
@@ -272,66 +277,73 @@ class _Tube:
             if isinstance(constants, str):
                 return constants
             bound = self._bounded(sol, constants, before, error)
-            if np.isfinite(bound.x).all():
-                n = sum(map(np.size, jtu.tree_leaves(x)))
-                start = ErrorEllipsoid.ball(error, n) if before is None else before.ellipsoid
-                return self._propagated(sol, constants, bound, start)
-            why = bound.why
-        return why
+            piece = self._sharpened(sol, constants, bound, before, error, reach)
+            if piece is not None and np.isfinite(piece.x).all():
+                self.width = max(1.0, self.width / 4.0)
+                return piece
+            self.width *= 4.0
+        self.width = 1.0
+        return bound.why
 
-    def _propagated(
-        self, sol: Solution, constants: Constants, bound: Bound, start: ErrorEllipsoid
-    ) -> _Piece:
+    def _sharpened(
+        self, sol: Solution, constants: Constants, bound: Bound, before: _Piece | None,
+        error: float, reach: float,
+    ) -> _Piece | None:  # fmt: skip
         """Return the piece with the smaller one of two bounds at each time: by constants, and by an
-        ellipsoid that starts as `start`."""
-        rates = [(float(constants.M), float(constants.growth_rate))]
-        if constants.one_sided is not None:
-            rates.append((1.0, float(constants.one_sided)))
-        rate = min(c for _, c in rates)
+        ellipsoid. None: the distance of the trajectories is not proved to stay below `reach`, and may
+        be so with a larger one."""
         x, u = np.asarray(bound.x, float), np.asarray(bound.u, float)
-        times = np.asarray(sol.ts, float) - float(sol.setup.setting["t0"])
+        rates = [constants.growth_rate, constants.one_sided]
+        rate, L = min(float(v) for v in rates if v is not None), float(constants.L)
+        without = _Piece(sol, bound, rate, x, u, None, np.inf, False)
+        if self.size > MAX_UNKNOWNS:
+            return without
+        ball = lambda radius: ErrorEllipsoid.ball(radius, self.size)  # noqa: E731
+        without = without._replace(ellipsoid=ball(x[-1]))
+        start = ball(error) if before is None or before.ellipsoid is None else before.ellipsoid
         integral, of_x, of_law = disturbances(self.problem, sol, constants)
-        with np.errstate(over="ignore"):
-            growth = min(M * np.exp(max(c, 0.0) * times[-1]) for M, c in rates)
-        most, L = growth * (start.norm + integral[-1]), float(constants.L)
-        linear = None
-        if np.isfinite(most):
-            region = self._around(sol, most, L * most + float(np.max(of_law)))
-            linear = linearisation(self.system, region, L)
+        region = self._around(sol, reach, L * reach + float(np.max(of_law)), constants)
+        linear = None if region is None else linearisation(self.system, region, L)
         if linear is None:
-            ball = ErrorEllipsoid.ball(x[-1], len(start.B))
-            return _Piece(sol, bound, rate, x, u, ball, np.inf, False)
+            return without
+        times = np.asarray(sol.ts, float) - float(sol.setup.setting["t0"])
         found = propagate(linear, start, times, integral, of_x)
+        if not found.largest < reach:
+            return None if found.share < _MAX_GROWTH else without
         x = np.fmin(x, found.bounds)
         u = np.fmin(u, linear.gain * x + of_law)
-        ellipsoid = found.ellipsoid
-        if not ellipsoid.norm <= bound.x[-1]:
-            ellipsoid = ErrorEllipsoid.ball(x[-1], len(start.B))
+        ellipsoid = found.within(float(bound.x[-1]))
         return _Piece(sol, bound, rate, x, u, ellipsoid, found.share, linear.knows_law)
 
-    def _around(self, sol: Solution, of_x: float, of_u: float) -> Region:
-        """Return the region of both trajectories, whose distances have at most these norms."""
-        assert sol.bounds is not None
+    def _around(
+        self, sol: Solution, of_x: float, of_u: float, constants: Constants
+    ) -> Region | None:
+        """Return the region of both trajectories while the norms of their distances are at most these,
+        or None if it is not in the region of the constants."""
+        assert sol.bounds is not None and constants.domain is not None
         t0, t1 = (float(sol.setup.setting[name]) for name in ("t0", "t1"))
         x, u = (
-            jtu.tree_map(
-                lambda low, high, w, d=d: interval(
-                    np.asarray(low[-1], float) - d / np.sqrt(w),
-                    np.asarray(high[-1], float) + d / np.sqrt(w),
-                ),
-                *ends, weights,
+            _widened(
+                *(jtu.tree_map(lambda rows: np.asarray(rows[-1], float), v) for v in ends),
+                jtu.tree_map(lambda w, d=d: d / np.sqrt(w), weights),
             )
             for ends, weights, d in zip(sol.bounds, (self.weights, self.weights_u), (of_x, of_u))
-        )  # fmt: skip
-        return Region(interval(t0, t1), x, intersect(u, self.possible))
+        )
+        if not constants.domain.includes(x, u):
+            return None
+        response = intersect(jtu.tree_map(interval, *u), self.possible)
+        return Region(interval(t0, t1), jtu.tree_map(interval, *x), response)
 
-    def _margin(self, low: Tree, high: Tree, error: float, factor: float) -> Tree:
-        """Return how much wider than the boxes of x_c a tube is, if the bound is `error` at first."""
+    def _least_reach(self, low: Tree, high: Tree, error: float) -> float:
+        """Return the smallest bound on errors for which a tube is tried, if it is `error` at first."""
         ends = [jtu.tree_leaves(tree) for tree in (low, high, self.weights)]
         squares = (np.sum(w * np.maximum(np.abs(v), np.abs(z)) ** 2) for v, z, w in zip(*ends))
         size = np.sqrt(sum(map(np.sum, ends[2])))
         own = self.atol * size + self.rtol * np.sqrt(sum(squares))
-        reach = factor * (2.0 * error + 4.0 * own)
+        return float(2.0 * error + 4.0 * own)
+
+    def _margin(self, low: Tree, high: Tree, reach: float) -> Tree:
+        """Return how much wider than the boxes of x_c a tube is, for errors up to `reach`."""
         return jtu.tree_map(
             lambda v, z, w: 0.02 * (z - v) + reach / np.sqrt(w), low, high, self.weights
         )

@@ -58,6 +58,15 @@ class Domain(eqx.Module):
         margin = 1e-12 * max(abs(self.t0), abs(self.t1))
         return self.t0 - margin <= float(t0) and float(t1) <= self.t1 + margin
 
+    def includes(self, x: tuple[Tree, Tree], u: tuple[Tree, Tree]) -> bool:
+        """Return whether states and responses between these bounds (low, high) lie in the domain."""
+        for values, ends in ((x, self.x), (u, self.u)):
+            if ends is not None:
+                leaves = zip(*map(jtu.tree_leaves, (*values, *ends)), strict=True)
+                if not all((a >= low).all() and (b <= high).all() for a, b, low, high in leaves):
+                    return False
+        return True
+
     def has_args(self, args: Any, reads: Reads | None = None) -> bool:
         """Return whether `args`, and what the functions read, equal those of the constants; False for
         traced values."""

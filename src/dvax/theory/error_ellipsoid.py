@@ -17,8 +17,8 @@ from .linearisation import Linearisation, norm
 _ROUNDING = 1e-14
 """Relative rounding errors of a product of matrices and of an exponential, for each of their rows."""
 
-_PARTS = 64
-"""Largest number of parts of a span in which ‖e^{Cs}‖ is bounded."""
+_PARTS = 2**14
+"""Number of parts of a span in which ‖e^{Cs}‖ is bounded, times the size of C, at most."""
 
 _COUPLING = 1e-3
 """Relative size of the entries that are added to C for its scales, so that none is without limit."""
@@ -61,12 +61,21 @@ class ErrorEllipsoid(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Bounds of ‖e‖ at given times; an ellipsoid that contains e at the last one; and the share of e
-    that is due to the rest of the linearisation."""
+    """Bounds of ‖e‖ at given times, and the `largest` up to the last one; an ellipsoid that contains e
+    there; the share of e that is due to the rest of the linearisation; and the scales of its norm."""
 
     bounds: Values
+    largest: float
     ellipsoid: ErrorEllipsoid
     share: float
+    scales: Values
+
+    def within(self, radius: float) -> ErrorEllipsoid:
+        """Return the ellipsoid, or the ball of errors up to `radius` if that is smaller in the scaled
+        norm. In another norm a ball may be smaller that soon becomes larger."""
+        scaled = ErrorEllipsoid(self.scales[:, None] * self.ellipsoid.B)
+        is_smaller = radius * float(self.scales.max()) < scaled.norm
+        return ErrorEllipsoid.ball(radius, len(self.scales)) if is_smaller else self.ellipsoid
 
 
 def propagate(
@@ -77,23 +86,30 @@ def propagate(
 
     Let ‖e^{Cs}‖ ≤ m and, in the scaled norm ‖S·‖, ≤ m_S. Gronwall's lemma gives
     ‖Se‖ ≤ m_S(‖Se₀‖ + ‖S‖∫‖δ‖)e^{m_S rest t} =: s, and the variation of constants that e(t) − e^{Ct}e₀
-    is a sum of two parts, of norm ≤ m∫‖δ‖ and of scaled norm ≤ m_S rest t s.
+    is a sum of two parts, of norm ≤ m∫‖δ‖, or of scaled norm ≤ m_S‖S‖∫‖δ‖, and of scaled norm
+    ≤ m_S rest t s.
     """
     C, n, end = linear.C, len(start.B), float(times[-1])
     scales = _scales(C, linear.R)
+    least, most = float(scales.min()), float(scales.max())
     scaled = scales[:, None] * C / scales
     rest = linear.rest(scales) + _ROUNDING * n * norm(scaled)
     m, m_scaled = (_largest_exponential(v, end) for v in (C, scaled))
     share = m_scaled * rest * end
-    begin = ErrorEllipsoid(scales[:, None] * start.B).norm + float(scales.max()) * integral[-1]
+    disturbed = integral + _ROUNDING * n * np.linalg.norm(start.B)
+    begin = ErrorEllipsoid(scales[:, None] * start.B).norm
     with np.errstate(over="ignore", invalid="ignore"):
-        of_rest = m_scaled * rest * times * (m_scaled * begin * np.exp(share))
-        of_balls = m * (integral + _ROUNDING * n * np.linalg.norm(start.B)) + late
+        largest = m_scaled * (begin + most * disturbed[-1]) * np.exp(share)
+        of_rest = m_scaled * rest * times * largest
+        of_balls = m * disturbed
+    if 4.0 * m_scaled < m:  # a ball of the scaled norm is longer in some directions
+        of_rest, of_balls = of_rest + m_scaled * most * disturbed, np.zeros(len(times))
     different, place = np.unique(times, return_inverse=True)
     mapped = [ErrorEllipsoid(scipy.linalg.expm(C * t) @ start.B) for t in different]
-    bounds = np.array([one.norm for one in mapped])[place] + of_rest / float(scales.min())
+    own, of_balls = np.array([one.norm for one in mapped])[place], of_balls + late
     ellipsoid = mapped[-1].plus(np.diag(of_rest[-1] / scales)).plus_ball(float(of_balls[-1]))
-    return Propagated(bounds + of_balls, ellipsoid, share)
+    bounds = own + of_rest / least + of_balls
+    return Propagated(bounds, float(largest / least) + float(late.max()), ellipsoid, share, scales)
 
 
 def _scales(C: Values, R: Values) -> Values:
@@ -113,7 +129,7 @@ def _largest_exponential(C: Values, end: float) -> float:
     """Return a bound on ‖e^{Cs}‖ for 0 ≤ s ≤ end: the largest one on a grid, between whose points it
     grows at most at the rate of the symmetric part of C."""
     rate = max(float(np.linalg.eigvalsh(0.5 * (C + C.T))[-1]), 0.0)
-    parts = int(np.clip(np.ceil(20.0 * rate * end), 1, _PARTS))
+    parts = int(np.clip(np.ceil(20.0 * rate * end), 1, max(16, _PARTS // len(C) ** 2)))
     powers = [np.eye(len(C))]
     if parts > 1:
         factor = scipy.linalg.expm(C * (end / parts))
