@@ -165,7 +165,7 @@ def largest_ratio(system, x0, span, tol, method, count=40, **more):
 # Largest bound over the largest error, or over the tolerance if that is larger.
 CLOSE = {
     van_der_pol: 20.0, harvest: 10.0, pendulum: 10.0, fishery: 10.0, lorenz: 10.0, reaction: 10.0,
-    spring: 10.0, chain: 10.0,
+    spring: 10.0, chain: 10.0, sheared: 10.0, two_controls: 10.0,
 }  # fmt: skip
 
 
@@ -175,6 +175,30 @@ def test_bound_without_constants_is_above_the_error_and_of_its_size(family, valu
     system, x0 = family(value)
     ratio = largest_ratio(system, x0, SPANS.get(family, 5.0), 1e-6, method)
     assert ratio <= CLOSE.get(family, np.inf)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("family", "value", "span"),
+    [(van_der_pol, 1.0, 40.0), (spring, 40.0, 50.0), (chain, 1.0, 50.0), (pendulum, 3.0, 20.0),
+     (fishery, 0.5, 40.0), (reaction, 20.0, 20.0)],
+)  # fmt: skip
+def test_bounds_of_long_runs_stay_close_to_the_error(family, value, span):
+    system, x0 = family(value)
+    assert largest_ratio(system, x0, span, 1e-6, None) <= 20.0
+
+
+@pytest.mark.slow
+def test_a_bound_that_certifies_nothing_is_not_followed():
+    """Errors of x' = 3x grow by e^{60} over 20 seconds, as x does; those of its rest grow as fast."""
+    system = problem(
+        lambda t, x, u, args: jnp.stack([3.0 * x[0] + 0.1 * jnp.sin(x[1]) + 0.0 * u, -x[1]]),
+        lambda t, x, u, args: -x[0], dvax.sets.Box(-1.0, 1.0),
+    )  # fmt: skip
+    sol = dvax.solve(system, jnp.zeros(2), 0.0, 20.0, ts=np.array([1.0, 20.0]))
+    bound = dvax.bound_error(system, sol, initial_error=1e-6)
+    assert np.isfinite(bound.x[0]) and np.isinf(bound.x[1])
+    assert "has grown to 1e+06 times the solution" in bound.why
 
 
 @pytest.mark.thorough

@@ -157,6 +157,29 @@ def test_an_oscillator_of_any_frequency_keeps_its_errors():
         assert error.norm == pytest.approx(exact, rel=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_response_at_a_bound_is_not_taken_to_be_inside(seed):
+    """P⁻¹y and P P⁻¹y are rounded: a law at the end of its interval may seem to be inside."""
+    random = np.random.default_rng(seed)
+    entries, low = random.uniform(0.1, 3.0, size=20), random.normal(size=20)
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Diagonal(jnp.asarray(entries)),
+        K=dvax.sets.Box(jnp.asarray(low), jnp.asarray(low + 1.0)),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: 3.0 * x,
+        control_space=dvax.spaces.Euclidean(20),
+    )  # fmt: skip
+    system = System(problem, jnp.zeros(20), None, max_cuts=0)
+    end = np.where(random.uniform(size=20) < 0.5, low, low + 1.0) / entries
+    width = random.uniform(0.0, 1e-3, size=20)
+    u = interval(*np.sort([end, end + np.where(end * entries < low + 0.5, width, -width)], axis=0))
+    x = interval(u.low / 3.0 - 1e-3, u.high / 3.0 + 1e-3)
+    linear = linearisation(system, Region(interval(0.0, 1.0), x, u), 3.0)
+    # Slopes of u between 0 and 3 are possible in every entry.
+    for slope in (0.0, 3.0):
+        rest = linear.R.sum(axis=1) + np.sqrt(2.0) * 3.0 * np.linalg.norm(linear.W, axis=1)
+        assert (np.abs(slope - 1.0 - np.diag(linear.C)) <= rest + 1e-9).all()
+
+
 def test_the_rest_covers_both_sides_of_a_kink_for_laws_of_different_steepness():
     """x' = u₁ with u₁ = clip(−x, 0, 1) beside a law three times as steep: slopes −1 and 0 at x = 0."""
     problem = dvax.Problem(

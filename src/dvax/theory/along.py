@@ -1,21 +1,17 @@
-"""Error bounds from constants that hold along a trajectory, piece by piece in time.
+"""Error bounds along a trajectory, piece by piece in time.
 
 Constants of the whole space may not exist, and those of a region around a whole trajectory are large:
 errors then seem to grow everywhere as fast as they do in the worst place. Here time is cut into pieces,
-and each piece has the constants of a tube around the trajectory on it.
+and each piece has the constants and the derivatives of a tube around the trajectory on it.
 
-Let x_c be computed on [a, b] with an enclosed defect, and ‖x_c(a) − x(a)‖ ≤ B(a). `certificate` bounds
-‖x_c − x‖ up to b if the boxes that contain x_c, enlarged by this bound, lie in the tube. The next piece
-starts from x_c(b) with B(b). So x_c is a trajectory with a bound, whoever computed the solution that is
-to be bounded: its distance from x_c is added.
+Let x_c be computed on [a, b] with an enclosed defect, and let an ellipsoid contain x_c(a) − x(a). It is
+mapped along the linearised system (`linearisation`, `error_ellipsoid`), if that proves that x stays in
+the tube. The next piece starts from x_c(b) with the ellipsoid at b. So x_c is a trajectory with a
+bound, and the distance from x_c of the solution that is to be bounded is added.
 
-The boxes of x_c, enlarged by this bound, contain both trajectories, and the derivatives over them say
-how errors propagate (`linearisation`): an ellipsoid that contains the error is mapped by e^{Ct}, and a
-ball for the defect and the rest is added. So over many pieces errors grow as the linearised equation
-lets them, in whatever norm the space has. Where the rest is large, as for a law at a kink, the bound by
-constants may be smaller, and the ellipsoid becomes a ball.
-
-Where no ellipsoid is known, pieces with the same semigroup share one factor M (`continue_bound`): with
+`certificate` bounds ‖x_c − x‖ by the constants of the tube. Where the rest of the linearisation is
+large, as for a law at a kink, this bound may be smaller, and the ellipsoid becomes a ball. Where there
+is no ellipsoid, pieces with the same semigroup share one factor M (`continue_bound`): with
 L̃(s) of the piece that contains s, Gronwall's lemma for e^{−ωt}‖x_c − x‖ gives the factor
 e^{∫(ω + ML̃)}, which M multiplies once.
 """
@@ -59,7 +55,7 @@ _FIRST_PIECES = 32
 _MAX_GROWTH = 0.25
 """Largest product of the rate and the length of a piece. A shorter piece has a narrower tube."""
 
-_MAX_SHARE, _MAX_SUM = 0.01, 1.0
+_MAX_SHARE, _MAX_SUM = 0.003, 1.0
 """Largest share of the rest of the linearisation in the error of a piece, and in that of the run, if it
 is proportional to the length of a piece. The larger one of both limits a piece."""
 
@@ -322,17 +318,18 @@ class _Tube:
         or None if it is not in the region of the constants."""
         assert sol.bounds is not None and constants.domain is not None
         t0, t1 = (float(sol.setup.setting[name]) for name in ("t0", "t1"))
-        x, u = (
-            _widened(
-                *(jtu.tree_map(lambda rows: np.asarray(rows[-1], float), v) for v in ends),
-                jtu.tree_map(lambda w, d=d: d / np.sqrt(w), weights),
-            )
-            for ends, weights, d in zip(sol.bounds, (self.weights, self.weights_u), (of_x, of_u))
-        )
+        ends = zip(sol.bounds, (self.weights, self.weights_u), (of_x, of_u))
+        x, u = (self._box(*pair, weights, distance) for pair, weights, distance in ends)
         if not constants.domain.includes(x, u):
             return None
         response = intersect(jtu.tree_map(interval, *u), self.possible)
         return Region(interval(t0, t1), jtu.tree_map(interval, *x), response)
+
+    def _box(self, low: Tree, high: Tree, weights: Tree, distance: float) -> tuple[Tree, Tree]:
+        """Return bounds of all elements at most at this distance from ones between the last rows."""
+        last = lambda tree: jtu.tree_map(lambda rows: np.asarray(rows[-1], float), tree)  # noqa: E731
+        reach = jtu.tree_map(lambda w: distance / np.sqrt(w), weights)
+        return _widened(last(low), last(high), reach)
 
     def _least_reach(self, low: Tree, high: Tree, error: float) -> float:
         """Return the smallest bound on errors for which a tube is tried, if it is `error` at first."""

@@ -23,11 +23,12 @@ def bound_error(
     a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues from its last
     saved state. (With M > 1 every piece multiplies the bound by M.)
 
-    **Without constants** they are proved along the trajectory, in tubes around pieces of it, from the
-    code of f and h: no region has to be given, and errors grow in the bound as they do near the
-    trajectory. The problem is solved once more for this, by `ETD2RK` with tolerances of 10⁻⁹ to 10⁻⁵,
-    and the distance of `sol` from this run is added: `sol` may be of any method. There are about four
-    pieces for each factor e by which errors may grow.
+    **Without constants** the bound is proved along the trajectory, in tubes around pieces of it, from
+    the code of f and h: no region has to be given, and errors grow in the bound as those of the
+    linearised system do. The problem is solved once more for this, by `ETD2RK` with tolerances of
+    10⁻⁹ to 10⁻⁵, and the distance of `sol` from this run is added: `sol` may be of any method.
+    `x_paper` is then the bound that the constants of each piece give with the bound at its start, and
+    `x_sharp` is `x`. With more than 128 unknowns errors grow at the rates of these constants.
 
     If the solve did not record its defect (fixed steps), or the bounds of its trajectory (for constants
     of a region that were not passed to it), the problem is solved again with the same steps, and the

@@ -51,7 +51,7 @@ class ErrorEllipsoid(NamedTuple):
         if own == 0.0 or added == 0.0:
             return self if added == 0.0 else ErrorEllipsoid(other)
         parts = np.sqrt(1.0 + added / own) * self.B, np.sqrt(1.0 + own / added) * other
-        return ErrorEllipsoid(np.linalg.qr(np.hstack(parts).T, mode="r").T)
+        return ErrorEllipsoid(np.asarray(np.linalg.qr(np.hstack(parts).T, mode="r")).T)
 
     def plus_ball(self, radius: float) -> "ErrorEllipsoid":
         """Return an ellipsoid that contains all sums of an error and one of norm ≤ `radius`."""

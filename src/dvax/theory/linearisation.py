@@ -32,6 +32,9 @@ from .weights import roots
 MAX_UNKNOWNS = 128
 """Largest number of unknowns of x, and of u."""
 
+_SEPARATION = 1e-12
+"""Relative distance from which two numbers differ by more than rounding errors."""
+
 
 class Linearisation(NamedTuple):
     """|e' − Ce − δ| ≤ R|e| + W|g| entry by entry, with ‖g‖ ≤ √2 L‖e‖, and ‖v‖ ≤ gain·‖e‖, in
@@ -116,12 +119,13 @@ def _derivative_of_projection(
     if bounds is None:
         return None
     low, high = bounds
-    middle, half = (
-        P.center[0] @ (0.5 * (u_low + u_high)),
-        np.abs(P.center[0]) @ (0.5 * (u_high - u_low)),
-    )
+    # u is P⁻¹y with rounding errors, which must not look like a distance of y from its bounds.
+    size, matrix = np.maximum(np.abs(u_low), np.abs(u_high)), np.abs(P.center[0])
+    half = matrix @ (0.5 * (u_high - u_low) + _SEPARATION * size)
+    middle = P.center[0] @ (0.5 * (u_low + u_high))
     is_inside = (middle - half > root * low.high) & (middle + half < root * high.low)
-    is_at_end = (h_low - u_high > 0.0) | (h_high - u_low < 0.0)
+    apart = _SEPARATION * (size + np.maximum(np.abs(h_low), np.abs(h_high)))
+    is_at_end = (h_low - u_high > apart) | (h_high - u_low < -apart)
     zeros, ones = np.zeros(len(root)), np.ones(len(root))
     return np.where(is_inside & ~is_at_end, ones, zeros), np.where(is_at_end, zeros, ones)
 
