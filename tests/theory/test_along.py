@@ -164,7 +164,7 @@ def largest_ratio(system, x0, span, tol, method, count=40, **more):
 
 # Largest bound over the largest error, or over the tolerance if that is larger.
 CLOSE = {
-    van_der_pol: 20.0, harvest: 10.0, pendulum: 10.0, fishery: 10.0, lorenz: 10.0, reaction: 10.0,
+    van_der_pol: 10.0, harvest: 10.0, pendulum: 10.0, fishery: 10.0, lorenz: 10.0, reaction: 10.0,
     spring: 10.0, chain: 10.0, sheared: 10.0, two_controls: 10.0,
 }  # fmt: skip
 
@@ -185,12 +185,12 @@ def test_bound_without_constants_is_above_the_error_and_of_its_size(family, valu
 )  # fmt: skip
 def test_bounds_of_long_runs_stay_close_to_the_error(family, value, span):
     system, x0 = family(value)
-    assert largest_ratio(system, x0, span, 1e-6, None) <= 20.0
+    assert largest_ratio(system, x0, span, 1e-6, None) <= 10.0
 
 
 @pytest.mark.slow
 def test_a_bound_that_certifies_nothing_is_not_followed():
-    """Errors of x' = 3x grow by e^{60} over 20 seconds, as x does; those of its rest grow as fast."""
+    """The state stays at 0, and an initial error of x' = 3x grows by e^{60} over 20 seconds."""
     system = problem(
         lambda t, x, u, args: jnp.stack([3.0 * x[0] + 0.1 * jnp.sin(x[1]) + 0.0 * u, -x[1]]),
         lambda t, x, u, args: -x[0], dvax.sets.Box(-1.0, 1.0),

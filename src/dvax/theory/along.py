@@ -56,12 +56,12 @@ _MAX_GROWTH = 0.25
 """Largest product of the rate and the length of a piece. A shorter piece has a narrower tube."""
 
 _MAX_SHARE, _MAX_SUM = 0.003, 1.0
-"""Largest share of the rest of the linearisation in the error of a piece, and in that of the run, if it
-is proportional to the length of a piece. The larger one of both limits a piece."""
+"""Largest share of the rest of the linearisation in the error of a piece, and in the errors of all
+pieces together. A piece may have the first, or its part of the second by length, if that is larger."""
 
-_PATIENCE = 4
-"""Number of pieces with an unknown derivative of the law after which the next ones are as long as the
-growth by constants allows. A kink that is crossed takes fewer."""
+_MAX_AT_KINK = 4
+"""Number of pieces in a row with an unknown derivative of the law, after which the law is taken to stay
+at a kink: then the growth by constants limits the pieces. A kink that is crossed takes fewer."""
 
 _SHORTEST = 2.0**-14
 """Shortest piece, as a part of the run."""
@@ -96,10 +96,11 @@ class _Piece(NamedTuple):
     share: float
     knows_law: bool
 
-    def excess(self, length: float, span: float, impatient: bool) -> float:
-        """Return how much too long a piece of this length is in a run of this span, as a factor."""
+    def excess(self, length: float, span: float, at_kink: bool) -> float:
+        """Return by which factor a piece of this length is too long in a run of this span; `at_kink`:
+        the law stays at a kink."""
         of_rest = self.share / max(_MAX_SHARE, _MAX_SUM * length / span)
-        by_constants = self.ellipsoid is None or impatient
+        by_constants = self.ellipsoid is None or at_kink
         return min(self.rate * length / _MAX_GROWTH, of_rest) if by_constants else of_rest
 
 
@@ -123,7 +124,7 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
     before: _Piece | None = None
     a, length, why = t0, (end - t0) / _FIRST_PIECES, ""
     norm = jax.vmap(problem.spaces(sol.setup.x0)[0].norm)
-    unknown = 0  # number of the last pieces with an unknown derivative of the law
+    unknown = 0  # pieces in a row with an unknown derivative of the law
     rows: list[_Row] = []
     statuses: list[Status] = []
     while len(rows) < len(ts):
@@ -136,9 +137,9 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
         # A saved time at t0 belongs to the first piece.
         saved = left[: np.searchsorted(left, b, side="right")]
         piece = tube.piece(a, b, saved, before, initial_error)
-        span, impatient = end - t0, unknown >= _PATIENCE
+        span, at_kink = end - t0, unknown >= _MAX_AT_KINK
         if b - a > _SHORTEST * span and (
-            isinstance(piece, str) or piece.excess(b - a, span, impatient) > 1.0
+            isinstance(piece, str) or piece.excess(b - a, span, at_kink) > 1.0
         ):
             length = 0.5 * (b - a)
             continue
@@ -149,7 +150,7 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
             why = f"at t = {b:.6g} it has grown to {_USELESS:.0g} times the solution"
             break
         unknown = 0 if piece.knows_law else unknown + 1
-        if piece.excess(length, span, impatient) < 0.25:
+        if piece.excess(length, span, at_kink) < 0.25:
             length = min(2.0 * length, (end - t0) / 8)
         rows += _rows(piece, saved)
         statuses.append(piece.bound.status)
@@ -180,6 +181,7 @@ class _Tube:
         self.weights = of_space(self.system.state, setup.x0)
         self.weights_u = of_space(self.system.control, self.system.u0)
         self.size = sum(map(np.size, jtu.tree_leaves(setup.x0)))
+        # Factor of the smallest reach of a tube, which the pieces adapt.
         self.limits_u, self.width = False, 1.0
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
