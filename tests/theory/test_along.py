@@ -7,6 +7,8 @@ import pytest
 from tests.selection import mostly_thorough
 
 import dvax
+from dvax.evolution.rows import cut
+from dvax.theory.along import BoundAlong
 
 LINE, PLANE = dvax.spaces.Euclidean(()), dvax.spaces.Euclidean(2)
 
@@ -265,6 +267,27 @@ def test_any_saved_times_have_a_bound(ts):
     bound = dvax.bound_error(system, sol)
     error = np.linalg.norm(np.asarray(sol.xs - exact.xs), axis=1)
     assert (error <= np.asarray(bound.x) + 1e-11).all() and float(bound.x.max()) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", [van_der_pol, spring])
+def test_a_solution_in_parts_has_the_bound_of_the_whole(family):
+    """As runs of the command line have it, which do not keep the whole solution."""
+    system, x0 = family(FAMILIES[family][1])
+    sol = dvax.solve(system, x0, 0.0, 4.0, ts=np.linspace(0.0, 4.0, 41))
+    whole = np.asarray(dvax.bound_error(system, sol).x)
+    parts = [cut(sol, slice(k, k + 10)) for k in range(0, 41, 10)]
+    follower = BoundAlong(system, parts[0], 4.0)
+    found = [follower.bound(part) for part in parts]
+    assert all(bound.status == "proved" and not bound.why for bound in found)
+    joined = np.concatenate([np.asarray(bound.x) for bound in found])
+    exact = dvax.solve(system, x0, 0.0, 4.0, ts=sol.ts, rtol=1e-12, atol=1e-12)
+    assert (np.linalg.norm(np.asarray(sol.xs - exact.xs), axis=1) <= joined + 1e-11).all()
+    assert joined.max() <= 2.0 * whole.max()
+    # No step is left for the parts behind a limit.
+    short = BoundAlong(system, parts[0], 4.0, max_steps=100)
+    assert np.isinf(short.bound(parts[0]).x[-1]) and "steps at t = " in short.why
+    assert np.isinf(short.bound(parts[1]).x).all()
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from ..programs.enclosure import is_enclosure
 
 
 class Bounds(NamedTuple):
-    """Entrywise bounds (low, high) on x_h and on u_h.
+    """Entrywise bounds (low, high) on x_h and on u_h, from one saved time to the next.
 
     ```python
     >>> import dvax
@@ -24,7 +24,7 @@ class Bounds(NamedTuple):
     ... )
     >>> check = dvax.verify(problem, 0.0, 0.0, 2.0, x=(-1.0, 1.0))
     >>> sol = dvax.solve(problem, 0.0, 0.0, 2.0, constants=check.constants)
-    >>> low, high = sol.bounds.x                   # boxes that x does not leave, up to each saved time
+    >>> low, high = sol.bounds.x                   # boxes that x does not leave before each saved time
     >>> bool((-1.0 < low).all() and (high < 1.0).all())
     True
 

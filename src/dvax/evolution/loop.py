@@ -35,9 +35,10 @@ STEP = "dvax_step"
 class State(NamedTuple):
     """Where the loop stands: after `steps` accepted ones of `attempts`.
 
-    `last` is the last step and what had disturbed the state before it, kept where saved times may lie
-    inside steps that are already taken; `records` all of them, for dense output; `ends` the times at
-    which they ended and `checkpoints` some of the states they began with, for the reverse pass.
+    `bounds` are those since the last saved time. `last` is the last step, what had disturbed the state
+    before it, and the bounds in it, kept where saved times may lie inside steps that are already taken;
+    `records` all of them, for dense output; `ends` the times at which they ended and `checkpoints` some
+    of the states they began with, for the reverse pass.
     """
 
     t: Any
@@ -48,7 +49,7 @@ class State(NamedTuple):
     control: Any
     jumped: Any
     bounds: Bounds | None
-    last: tuple[Record, tuple[Any, Any]] | None
+    last: tuple[Record, tuple[Any, Any], Bounds | None] | None
     records: Record | None
     ends: jax.Array | None
     checkpoints: Checkpoints | None
@@ -109,7 +110,9 @@ class Loop(eqx.Module):
             # One turn more than there are saved times, for the way from the last of them to the end.
             state, rows, row = self._through(*carry, times)
             rows = _put(rows, row, self._read(state, _at(times, row)))
-            return state, rows, row + 1
+            # The last step may reach over the saved time.
+            bounds = state.bounds if state.last is None else state.last[2]
+            return state._replace(bounds=bounds), rows, row + 1
 
         start = state, rows, jnp.asarray(0)
         state, rows, _ = lax.while_loop(lambda carry: carry[2] <= count, turn, start)
@@ -121,6 +124,7 @@ class Loop(eqx.Module):
         zero = jnp.zeros_like(t0)
         measure = stepper.measure
         record = Record(t0, zero, x0, (_tree.zeros_like(x0),) * (stepper.method.degree + 1))
+        bounds = stepper.bounds(x0)
         many = lambda leaf: jnp.zeros((self.max_steps, *leaf.shape), leaf.dtype)  # noqa: E731
         records = jtu.tree_map(many, record) if self.dense else None
         if records is not None:
@@ -134,8 +138,8 @@ class Loop(eqx.Module):
             propagators=None if own else stepper.propagators(controller.end(control) - t0),
             control=control,
             jumped=jnp.asarray(True),
-            bounds=stepper.bounds(x0),
-            last=(record, (zero, zero)) if saves and measure else None,
+            bounds=bounds,
+            last=(record, (zero, zero), bounds) if saves and measure else None,
             records=records,
             ends=jnp.zeros(self.max_steps, t0.dtype)
             if checkpoints is not None and controller.adapts
@@ -251,7 +255,7 @@ class Loop(eqx.Module):
             assert step.bounds is not None
             bounds = bounds.hull(step.bounds)
         ahead = (t1, step.x1, integrated_defect, step.solver_state, decision.jumped, bounds)
-        last = None if state.last is None else (taken, state.integrated_defect)
+        last = None if state.last is None else (taken, state.integrated_defect, step.bounds)
         if self.check_finite:
             behind = (
                 t0,
@@ -358,7 +362,7 @@ class Loop(eqx.Module):
             met = time <= t0 + slack(t0)
             reached = met | ((t1 > time) & (state.result == RESULTS.successful))
             return self._row(state, time, lax.cond(met, lambda: state.x, between), reached, met)
-        record, before = state.last
+        record, before, _ = state.last
         theta = (time - record.start) / jnp.where(record.length > 0, record.length, 1)
         reached, met = state.t >= time, time >= state.t
         guess = state.solver_state.guess

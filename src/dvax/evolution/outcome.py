@@ -30,7 +30,8 @@ class Saved(NamedTuple):
     - `integrated_defect`: (∫ ‖p − f̃(·, x_h)‖ ds, ∫ ‖w‖ ds) up to the end of the step that contains t,
       None if it is not measured. (x_h is the exact solution of the system with this disturbance.)
     - `completed_defect`: the same up to the start of that step;
-    - `bounds`: the bounds of x_h and u_h from t0 to the end of that step, None if they are not tracked;
+    - `bounds`: the bounds of x_h and u_h since the saved time before, or t0, to the end of that step,
+      None if they are not tracked;
     - `guess`: the initial guess for the solver of the law;
     - `step`: the number of steps up to t if a step ends at t, −1 if t lies inside a step.
     """

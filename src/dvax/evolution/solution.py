@@ -64,8 +64,8 @@ class Solution(eqx.Module):
       it. None if it is not measured (fixed steps without `measure=True`);
     - `law_defect`: the integral of ‖w‖ over the frozen solves, or None;
     - `completed_defect`: (defect, law_defect) at the start of the step that contains each saved time;
-    - `bounds`: bounds on x_h and u_h from t0 to the end of that step, if `constants=` hold in a region
-      only, else None;
+    - `bounds`: bounds on x_h and u_h since the saved time before, or t0, to the end of that step, if
+      `constants=` hold in a region only, else None; of `Picard` and `PiecewiseLinear` since t0;
     - `enclosed`: True if the defect and `bounds` are enclosures over every step
       (`dvax.programs.enclosure`), False if samples estimate them;
     - `stats`: the `method`, with the reason where it was chosen; the numbers of accepted `steps`, of

@@ -42,8 +42,8 @@ class Block(NamedTuple):
         a, b = with_equal_counts(self, other)
         return Block(a.center + sign * b.center, a.radius + b.radius)
 
-    def times(self, factor: float) -> "Block":
-        return Block(factor * self.center, abs(factor) * self.radius)
+    def times(self, factor: Values) -> "Block":
+        return Block(factor * self.center, np.abs(factor) * self.radius)
 
     def norm(self) -> float:
         """Return sup ‖·‖ over the enclosed matrices, with ‖Δ‖₂ ≤ ‖|Δ|‖₂ ≤ ‖radius‖₂."""

@@ -38,6 +38,7 @@ from ..operators import AbstractOperator, Spectrum
 from ..problem import Problem
 from .constants import Constants
 from .domain import Domain
+from .error_ellipsoid import Disturbances
 from .status import Status, weakest
 
 
@@ -140,17 +141,19 @@ def continue_bound(problem: Problem, sol: Solution, constants: Constants, before
     return _bound_error(problem, sol, constants, tuple(before.integrals[-1]))
 
 
-def disturbances(
-    problem: Problem, sol: Solution, c: Constants
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return, for each saved time of a solution whose defect is known, ∫‖δ‖ up to it, how far x moves
-    within a few roundings of it, and the distance of u from the solution of the law."""
+def disturbances(problem: Problem, sol: Solution, c: Constants) -> tuple[Disturbances, np.ndarray]:
+    """Return, for each saved time of a solution whose defect is known, what disturbs x, late errors
+    being its motion within a few roundings of t; and the distance of u from the solution of the law."""
     args, t0 = _tree.as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     of_x, of_u = _roundoff(current(problem), args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
     law = sol.law_residual, sol.law_step, of_u
-    total = disturbance(c, np.asarray(sol.defect, float), np.asarray(sol.law_defect, float))
+    assert sol.completed_defect is not None
+    total, completed = (
+        np.asarray(disturbance(c, *(np.asarray(v, float) for v in parts)))
+        for parts in ((sol.defect, sol.law_defect), sol.completed_defect)
+    )
     of_law = _law_error(c, *(np.asarray(v, float) for v in law))
-    return np.asarray(total), np.asarray(of_x, float), np.asarray(of_law)
+    return Disturbances(total, completed, np.asarray(of_x, float)), np.asarray(of_law)
 
 
 def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial: tuple) -> Bound:

@@ -87,8 +87,8 @@ class Domain(eqx.Module):
     ) -> jax.Array:
         """Return, for each saved time, whether the exact x and u lie in the domain up to that time.
 
-        `x` and `u` are bounds (low, high) on the computed values, and `x_error` and `u_error` are
-        bounds on the norms of their errors.
+        `x` and `u` are bounds (low, high) on the computed values since the saved time before, and
+        `x_error` and `u_error` are bounds on the norms of their errors.
         """
         inside = jnp.ones(x_error.shape, bool)
         for values, error, ends, space in zip((x, u), (x_error, u_error), (self.x, self.u), spaces):

@@ -77,6 +77,51 @@ def test_a_run_has_the_variables_of_the_model_by_name_and_unit(outcome):
     assert outcome.summary["error_bound"]["unit"] == data["error_bound"].attrs["units"] == "mm"
 
 
+OSCILLATOR = (
+    HEAD
+    + """
+def build(pull: float = 1.0, opaque: bool = False):
+    bend = (lambda v: jnp.fft.irfft(jnp.fft.rfft(v) ** 2, 2)) if opaque else (lambda v: v**2)
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(0.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-0.5, 0.5),
+        f=lambda t, x, u, args: jnp.stack([x[1], (1.0 - bend(x)[0]) * x[1] - x[0] + u]),
+        h=lambda t, x, u, args: -pull * x[1], control_space=dvax.spaces.Euclidean(()),
+    )
+    return dvax.models.Model(problem, jnp.array([1.0, 0.0]), 6.0, states={"a": "m", "b": "m"})
+"""
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pull", [1.0, 20.0])
+def test_a_nonlinear_problem_without_constants_has_a_proved_bound(tmp_path, pull):
+    """Van der Pol's oscillator, whose f has no Lipschitz constant."""
+    table = TABLE.replace("frames = 20", "frames = 60") + f"[model.parameters]\npull = {pull}\n"
+    config = read_config(written(tmp_path, OSCILLATOR, table), allow_code=True)
+    found = run(config, tmp_path / "run")
+    data = xarray.open_zarr(found.directory / "trajectory.zarr")
+    bound = data["error_bound"]
+    assert bound.attrs["status"] == "proved" and found.summary["error_bound"]["bound"] == "proved"
+    own = config.model.own
+    sharp = dict(rtol=1e-12, atol=1e-12, method=dvax.ExpRosenbrock())
+    exact = dvax.solve(own.problem, own.x0, 0.0, 6.0, ts=data["time"].values, **sharp)
+    apart = np.hypot(data["a"].values - exact.xs[:, 0], data["b"].values - exact.xs[:, 1])
+    assert (apart <= bound.values + 1e-11).all()
+    assert bound.values.max() <= 10.0 * max(apart.max(), 1e-7)
+
+
+@pytest.mark.slow
+def test_a_problem_whose_code_proves_nothing_says_so_in_its_summary(tmp_path):
+    table = TABLE + "[model.parameters]\nopaque = true\n"
+    config = read_config(written(tmp_path, OSCILLATOR, table), allow_code=True)
+    found = run(config, tmp_path / "run").summary["error_bound"]
+    assert not np.isfinite(float(found["value"])) and "alpha_f is not proved" in found["why"]
+    table = TABLE.replace("frames = 20", "frames = 20\nbound_steps = 0")
+    config = read_config(written(tmp_path, OSCILLATOR, table), allow_code=True)
+    found = run(config, tmp_path / "other").summary["error_bound"]
+    assert found["bound"] == "estimated" and "larger than any number" in found["why"]
+
+
 @pytest.mark.slow
 def test_the_report_says_that_code_ran_and_draws_the_variables_in_order(outcome):
     page = build_report(outcome.directory).read_text()

@@ -401,8 +401,9 @@ def test_ready_models_run_for_parameters_in_plausible_ranges(name, seed, tmp_pat
     model = model_of(tmp_path, drawn(name, seed))
     plan = model.plan(lambda words: None)
     end = join_pieces(list(segments(plan)))
-    rows = model.rows(end, model.bound(end, None), len(plan.times))
-    found = model.results({key: v.values for key, v in rows.items()}, end, "estimated")
+    bound = model.bound(end, None)
+    rows = model.rows(end, bound, len(plan.times))
+    found = model.results({key: v.values for key, v in rows.items()}, end, bound)
     for key, figure in found.figures.items():
         if key != "error_bound":  # infinite where no constants are small enough
             assert np.all(np.isfinite(np.asarray(figure.value, float))), key

@@ -32,6 +32,7 @@ TABLE = (
     '[model]\npython = "spring.py:build"\nframes = 2\n[output]\nreport = false\n'
     "[model.parameters]\nbend = 0.0\n"
 )
+BY_CONSTANTS = TABLE.replace("frames = 2", "frames = 2\nbound_steps = 0")
 WITH_ENERGY = TABLE.replace("frames = 2", "frames = 2\nenergy = true")
 
 
@@ -54,7 +55,7 @@ def bound(directory):
 
 @pytest.mark.slow
 def test_check_and_run_say_that_a_bound_certifies_no_digit_and_energy_makes_it_small(tmp_path):
-    file = written(tmp_path / "plain")
+    file = written(tmp_path / "plain", BY_CONSTANTS)
     told = call("check", file)
     assert "may certify no digit" in told and "Try energy = true" in told
     told = call("run", file, "-o", tmp_path / "run")
@@ -65,6 +66,24 @@ def test_check_and_run_say_that_a_bound_certifies_no_digit_and_energy_makes_it_s
     assert "certif" not in call("check", file)
     assert "certif" not in call("run", file, "-o", tmp_path / "small")
     assert bound(tmp_path / "small")["relative"] < 1e-3
+
+
+@pytest.mark.slow
+def test_the_bound_of_a_plain_run_is_proved_along_the_trajectory(tmp_path):
+    file = written(tmp_path / "plain")
+    assert "certif" not in call("check", file)
+    assert "certif" not in call("run", file, "-o", tmp_path / "run")
+    found = bound(tmp_path / "run")
+    assert found["bound"] == "proved" and found["relative"] < 1e-6
+
+
+@pytest.mark.slow
+def test_a_bound_that_ends_says_why_and_what_to_try(tmp_path):
+    file = written(tmp_path / "short", TABLE.replace("frames = 2", "frames = 2\nbound_steps = 50"))
+    told = call("run", file, "-o", tmp_path / "run")
+    assert "not finite" in told and "steps at t = " in told and "larger bound_steps" in told
+    found = bound(tmp_path / "run")
+    assert not np.isfinite(float(found["value"])) and "steps at t = " in found["why"]
 
 
 @pytest.mark.parametrize(("states", "space", "unit"), [
@@ -98,6 +117,7 @@ def test_energy_is_refused_where_nothing_is_searched(tmp_path, monkeypatch):
     ({"value": 3.0, "bound": "proved", "relative": 1.5}, "certifies no digit"),
     ({"value": None, "bound": "proved"}, "not finite"),
     ({"value": "inf", "bound": "estimated"}, "not finite"),
+    ({"value": "inf", "bound": "proved", "why": "of a kink"}, "about the error: of a kink."),
     ({"value": 3.0, "bound": "proved", "relative": 0.5}, None),
     ({"value": None, "bound": "not known"}, None),
 ])  # fmt: skip

@@ -191,7 +191,7 @@ def _solved(
         rows.append(model.rows(None, None, 1))
     series = {name: np.concatenate([row[name].values for row in rows]) for name in rows[0]}
     whole = join_pieces(pieces, len(plan.times)) if model.whole and pieces else end
-    results = model.results(series, whole, "" if bound is None else bound.status)
+    results = model.results(series, whole, bound)
     variables = {
         name: Variable.of(
             np.asarray(series.get(name, v.values)), v.dims,

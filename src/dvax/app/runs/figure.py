@@ -13,8 +13,8 @@ SAYS_NOTHING = "; it is not finite, so it gives no bound"
 class Figure:
     """A headline figure: a number, or a list of them; `error`: a proved bound on its error, or on those
     of its entries, where there is one. A figure that is a bound itself says in `bound` how much is
-    known of it: "proved", "declared" or "estimated", and in `relative` its ratio to the norm of the
-    computed solution, where this is positive."""
+    known of it: "proved", "declared" or "estimated", in `relative` its ratio to the norm of the
+    computed solution, where this is positive, and in `why` the reason if it is not finite."""
 
     value: Any
     unit: str
@@ -22,6 +22,7 @@ class Figure:
     error: Any = None
     bound: str | None = None
     relative: float | None = None
+    why: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """The entry of summary.json. The meaning of a bound says where it is infinite or NaN."""
@@ -34,6 +35,8 @@ class Figure:
             finite = all(math.isfinite(v) for v in values if isinstance(v, float))
             entry["meaning"] += "" if finite else SAYS_NOTHING
             entry["bound"] = self.bound
+            if not finite and self.why:
+                entry["why"] = self.why
         if self.relative is not None and math.isfinite(self.relative):
             entry["relative"] = float(self.relative)
         return entry

@@ -41,7 +41,9 @@ def useless_bound(summary: Mapping[str, Mapping[str, Any]], remedy: str) -> str 
     if entry is None or entry["bound"] not in ORDER:
         return None
     if not is_finite(entry):
-        return f"The error bound is not finite, so that it states nothing about the error. {remedy}"
+        why = f": {entry['why']}" if "why" in entry else ""
+        said = f"The error bound is not finite, so that it states nothing about the error{why}."
+        return f"{said} {remedy}"
     if not certifies_no_digit(entry):
         return None
     amount = entry_text(entry).removeprefix("≤ ")

@@ -8,6 +8,7 @@ from dvax.app.runs.applications.base import Figure, Variable
 from dvax.evolution import Implicit, Solution
 from dvax.problem import Problem
 from dvax.theory import Bound, Constants, bound_error, weakest
+from dvax.theory.along import BoundAlong
 from dvax.theory.certificate import continue_bound
 
 
@@ -15,12 +16,13 @@ class Certificate(NamedTuple):
     """A bound on ‖x_h − x‖ at every saved time, and what it rests on.
 
     A piece of a run that goes on needs its `bound`. `size` is the largest norm of the computed state at
-    the saved times so far."""
+    the saved times so far, and `why` the reason for which the bound is infinite from some time on."""
 
     values: np.ndarray
     status: Any
     bound: Bound | None = None
     size: float = 0.0
+    why: str = ""
 
     @property
     def largest(self) -> float | None:
@@ -33,7 +35,7 @@ class Certificate(NamedTuple):
         top = self.largest
         relative = None if top is None or not 0 < self.size < np.inf else top / self.size
         said = f"{words} ({self.status})"
-        return Figure(top, unit, said, bound=self.status, relative=relative)
+        return Figure(top, unit, said, bound=self.status, relative=relative, why=self.why)
 
     def variable(self, dimension: str, unit: str, words: str) -> Variable:
         """The bounds at the saved times."""
@@ -65,4 +67,11 @@ def certificate(
     else:
         bound = continue_bound(problem, solution, constants, before.bound)
         status = before.status
-    return Certificate(np.asarray(bound.x), weakest(status, bound.status), bound)
+    return Certificate(np.asarray(bound.x), weakest(status, bound.status), bound, why=bound.why)
+
+
+def along(follower: BoundAlong, solution: Solution, before: Certificate | None) -> Certificate:
+    """Return the bound of the next piece, proved along the trajectory."""
+    bound = follower.bound(solution)
+    status = bound.status if before is None else weakest(before.status, bound.status)
+    return Certificate(np.asarray(bound.x), status, None, why=bound.why)

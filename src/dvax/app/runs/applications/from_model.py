@@ -246,12 +246,19 @@ class AbstractModelApplication(abc.ABC):
 
     def bound(self, piece: Any, before: Certificate | None) -> Certificate | None:
         """The bound on the error of a piece of the run, which goes on from the one `before`."""
-        if self.constants is None or piece is None:
+        if piece is None:
             return None
-        found = certificate(self.own.problem, piece, self.constants, before)
+        found = self._bound(piece, before)
+        if found is None:
+            return None
         space = self.own.problem.spaces(self.own.x0)[0]
         size = float(np.max(self.per_row("norm", space.norm, piece.xs)))
         return found._replace(size=size if before is None else max(size, before.size))
+
+    def _bound(self, piece: Any, before: Certificate | None) -> Certificate | None:
+        if self.constants is None:
+            return None
+        return certificate(self.own.problem, piece, self.constants, before)
 
     def rows(self, piece: Any, bound: Certificate | None, count: int) -> dict[str, Variable]:
         """The variables over time at the first `count` rows of a piece: those that follow repeat the
@@ -266,16 +273,13 @@ class AbstractModelApplication(abc.ABC):
         return {key: replace(v, values=np.asarray(v.values)[:count]) for key, v in found.items()}
 
     def results(
-        self, series: Mapping[str, np.ndarray], end: Any, status: str, size: float = 0.0
+        self, series: Mapping[str, np.ndarray], end: Any, bound: Certificate | None = None
     ) -> Results:
-        """The results after the last row of the piece `end`; `status`: of the bound in the series, and
-        `size`: the largest norm of the state."""
-        scaled = self.bound_scale * size
-        bound = (
-            Certificate(series["error_bound"], status, size=scaled)
-            if "error_bound" in series
-            else None
-        )
+        """The results after the last row of the piece `end`; `bound`: of the last piece, whose values
+        those of the series replace."""
+        if bound is not None:
+            scaled = self.bound_scale * bound.size
+            bound = bound._replace(values=series["error_bound"], size=scaled)
         figures, fixed = self.figures(series, end, bound), self.fixed(end)
         return Results(figures, fixed, lambda directory: self.write_files(directory, end))
 

@@ -201,10 +201,9 @@ class ApplicationRun(AbstractRun):
     def _compute(self) -> Callable[[], Results]:
         """Return a function that computes the results of the rows in the store."""
         assert self.store is not None
-        series, end = self.store.series(), self.end
-        status, size = ("", 0.0) if self.bound is None else (self.bound.status, self.bound.size)
+        series, end, bound = self.store.series(), self.end, self.bound
         whole = self._whole(series[self.store.axis]) if self.model.whole else lambda: end
-        return lambda: self.model.results(series, whole(), status, size)
+        return lambda: self.model.results(series, whole(), bound)
 
     def _whole(self, times: np.ndarray) -> Callable[[], Solution]:
         """Return a function that reads and joins the pieces with these times. Their last row is

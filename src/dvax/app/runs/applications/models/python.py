@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, PlainValidator, model_validator
 
 from dvax.app.runs.applications.base import Figure, Variable
-from dvax.app.runs.applications.certificate import Certificate
+from dvax.app.runs.applications.certificate import Certificate, along
 from dvax.app.runs.applications.from_model import AbstractModelApplication, FramesKeys
 from dvax.app.runs.applications.own_parameters import PREFIX, Parameters, complete, unit_of
 from dvax.app.runs.schema import rule_error
@@ -24,7 +24,14 @@ from dvax.app.runs.units import converted
 from dvax.errors import DvaxError, InputError, Problems, input_error
 from dvax.evolution import Solution
 from dvax.models import Model
+from dvax.theory.along import BoundAlong
 from dvax.theory.energy import MAX_UNKNOWNS
+from dvax.theory.local_derivatives import MAX_UNKNOWNS as MAX_UNKNOWNS_ALONG
+
+_REMEDY_ALONG = (
+    "A larger bound_steps in [model] follows the trajectory further, a smaller rtol makes the bound "
+    "smaller: docs/models/own-problem.md says how."
+)
 
 
 def _number_or_text(value: Any) -> float | str | None:
@@ -61,6 +68,12 @@ class PythonSection(FramesKeys):
     )
     energy: bool = Field(
         False, description="search for a norm in which the error bound grows more slowly"
+    )
+    bound_steps: int = Field(
+        2_000_000,
+        ge=0,
+        description="largest number of steps of the trajectory along which the error bound is proved; "
+        "0: by constants for the whole space",
     )
 
     @model_validator(mode="before")
@@ -104,6 +117,12 @@ class PythonApplication(AbstractModelApplication):
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
         may_use_energy = not table.energy and _unknowns(model) <= MAX_UNKNOWNS
         self.energy, self.remedy = table.energy, _remedy(may_use_energy)
+        by_constants = model.constants is not None or table.certify or table.energy
+        is_small = _unknowns(model) <= MAX_UNKNOWNS_ALONG
+        self.is_followed = not by_constants and table.bound_steps > 0 and is_small
+        self.follower: BoundAlong | str = ""
+        if self.is_followed:
+            self.remedy = _REMEDY_ALONG
         self.whole, self.bound_unit = model.figures is not None, _bound_unit(model)
         if table.energy:
             with problems.collect():
@@ -140,6 +159,23 @@ class PythonApplication(AbstractModelApplication):
                 f"{self.verification.no_energy}."
             )
         return tuple(said)
+
+    def _note_on_bound(self) -> tuple[str, ...]:
+        # Along the trajectory errors grow less than by these constants.
+        return () if self.is_followed else super()._note_on_bound()
+
+    def _bound(self, piece: Solution, before: Certificate | None) -> Certificate | None:
+        if not self.is_followed:
+            return super()._bound(piece, before)
+        if before is None:
+            steps = self.table.bound_steps
+            try:
+                self.follower = BoundAlong(self.own.problem, piece, self.t_end, max_steps=steps)
+            except InputError as error:
+                self.follower = error.problems[0].rule
+        if isinstance(self.follower, BoundAlong):
+            return along(self.follower, piece, before)
+        return Certificate(np.full(len(piece.ts), np.inf), "estimated", why=self.follower)
 
     def series(self, solution: Solution, bound: Certificate | None) -> Mapping[str, Variable]:
         return {**self.named(solution), **self.bound_series(bound)}

@@ -1,0 +1,191 @@
+"""Derivatives of f and h on many short intervals of time, from one enclosure of their slopes.
+
+Interval arithmetic on every interval of time would take long. The derivatives J have slopes of their
+own, which are enclosed once over a region. For a box of half widths r around c inside the region
+
+    |J(z) − J(c)| ≤ Λ r   entry by entry,  Λ a bound on |∂J|,
+
+so that J is evaluated at the centers alone, for all boxes in one compiled call. The same holds for the
+values of h and for the ends of a box K(t).
+"""
+
+import itertools
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from .. import _tree
+from .._tree import Tree
+from ..problem import Problem
+from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, columns, interval
+from .blocks import Block, as_one_matrix
+from .projection_speed import slopes
+from .region import Region
+from .system import System
+from .weights import roots
+
+MAX_UNKNOWNS = 40
+"""Largest number of unknowns of x and u together: the slopes of J have their cube as entries."""
+
+_ROUNDINGS = 500.0
+"""Relative rounding errors of an entry of J, as a multiple of the unit roundoff."""
+
+
+class Range(NamedTuple):
+    """Values between two arrays."""
+
+    low: Values
+    high: Values
+
+
+class Derivatives(NamedTuple):
+    """∂f/∂x, ∂f/∂u, ∂h/∂x and ∂h/∂u in the norms of the spaces, as stacks with one matrix for each box;
+    the values there of u, of h, and of both ends of the box K(t), which are None if K is no box."""
+
+    f_x: Block
+    f_u: Block
+    h_x: Block
+    h_u: Block
+    u: Range
+    h: Range
+    ends: tuple[Range, Range] | None
+
+
+def of_region(system: System, region: Region) -> Derivatives | None:
+    """Return the derivatives over a region, as stacks of one matrix, or None if one is too large."""
+    J = system.at(region)
+    blocks = J.f_x, J.f_u, J.h_x, J.h_u
+    known = [b for b in blocks if b is not None]
+    if len(known) < len(blocks) or J.h is None:
+        return None
+    try:
+        f_x, f_u, h_x, h_u = map(as_one_matrix, known)
+    except TooLarge:
+        return None
+    bounds = system.interval_bounds(region.t)
+    low, high = (
+        (None, None) if bounds is None else (Range(b.low[None], b.high[None]) for b in bounds)
+    )
+    ends = None if low is None or high is None else (low, high)
+    return Derivatives(f_x, f_u, h_x, h_u, _range(region.u), _range(J.h), ends)
+
+
+class LocalDerivatives:
+    """The derivatives of a system on boxes inside a region."""
+
+    def __init__(self, system: System):
+        self.system = system
+        self.likes = jtu.tree_map(
+            lambda v: jnp.zeros(jnp.shape(v), jnp.result_type(float)), (system.x0, system.u0)
+        )
+        self.n, self.k = (
+            sum(map(np.size, jtu.tree_leaves(like))) for like in (system.x0, system.u0)
+        )
+        self.root_x = np.concatenate(roots(system.state, system.x0))
+        self.root_u = np.concatenate(roots(system.control, system.u0))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether x and u are small enough, and their functions have derivatives in forward mode."""
+        return self.n + self.k <= MAX_UNKNOWNS and self._enclosure is not None
+
+    def at(
+        self, region: Region, t: Range, x: Range, u: Range, capacity: int = 0
+    ) -> Derivatives | None:
+        """Return the derivatives on boxes, whose bounds have a row each, inside the region; None if
+        they are not known. For all numbers of boxes up to the `capacity` one program is compiled."""
+        if self._enclosure is None:
+            return None
+        try:
+            slopes_of = self._enclosure(region.t, *(_flat(tree) for tree in (region.x, region.u)))
+        except TooLarge:
+            return None
+        boxes = [
+            Range(v.low.reshape(len(v.low), -1), v.high.reshape(len(v.low), -1)) for v in (t, x, u)
+        ]
+        # In the precision of the evaluation, which may be single.
+        dtype = jnp.result_type(float)
+        centers = [(0.5 * (v.low + v.high)).astype(dtype).astype(float) for v in boxes]
+        halves = [np.maximum(v.high - c, c - v.low) for v, c in zip(boxes, centers, strict=True)]
+        count = len(centers[0])
+        more = max(0, capacity - count)
+        time, *others = (np.pad(c, ((0, more), (0, 0)), "edge") for c in centers)
+        values = _values(
+            self.system.problem, _tree.as_arrays(self.system.args),
+            (time[:, 0], *others), self.likes,
+        )  # fmt: skip
+        found = []
+        for value, slope in zip(values, slopes_of.out, strict=True):
+            center = np.asarray(value, float)[:count]
+            rounding = _ROUNDINGS * float(jnp.finfo(value.dtype).eps)
+            radius = np.where(np.isfinite(center), rounding * np.abs(center), 0.0)
+            for k, part in slope.parts.items():
+                full = columns(part, 1)
+                size = (np.abs(full.center) + full.radius).reshape(full.center.shape[0], -1)
+                with np.errstate(invalid="ignore"):
+                    moved = np.where(size == 0.0, 0.0, halves[k][:, :, None] * size).sum(axis=1)
+                radius = radius + moved.reshape(center.shape)
+            found.append((center, radius))
+        J, (h, *ends) = found[:4], (Range(c - r, c + r) for c, r in found[4:])
+        f_x, f_u, h_x, h_u = (
+            Block(center * (out[:, None] / into), radius * (out[:, None] / into))
+            for (center, radius), (out, into) in zip(
+                J, itertools.product((self.root_x, self.root_u), repeat=2), strict=True
+            )
+        )
+        box = (ends[0], ends[1]) if ends else None
+        return Derivatives(f_x, f_u, h_x, h_u, boxes[2], h, box)
+
+    @cached_property
+    def _enclosure(self) -> SlopeEnclosure | None:
+        system = self.system
+        flat = [jnp.zeros(size) for size in (self.n, self.k)]
+        try:
+            return SlopeEnclosure(
+                lambda *point: _evaluated(system.problem, system.args, point, self.likes),
+                (jnp.zeros(()), *flat), (0, 1, 2),
+            )  # fmt: skip
+        except NotImplementedError:  # a function without a derivative in forward mode
+            return None
+
+
+def _evaluated(problem: Problem, args: Any, point: tuple[Any, ...], likes: Any) -> tuple[Any, ...]:
+    """Return the derivatives of f and h at a point as matrices, the value of h, and the ends of K."""
+    t, x, u = point
+    of_x, of_u = (ravel_pytree(like)[1] for like in likes)
+
+    def both(x: Any, u: Any) -> Any:
+        f, h = (fn(t, of_x(x), of_u(u), args) for fn in (problem.f, problem.h))
+        return (ravel_pytree(f)[0], ravel_pytree(h)[0]), ravel_pytree(h)[0]
+
+    ((f_x, f_u), (h_x, h_u)), h = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(x, u)
+    bounds = problem.set_at(t, args).intervals(likes[1])
+    ends = () if bounds is None else tuple(ravel_pytree(end)[0] for end in bounds)
+    return f_x, f_u, h_x, h_u, h, *ends
+
+
+@eqx.filter_jit
+def _values(problem: Problem, args: Any, points: tuple[Any, ...], likes: Any) -> tuple[Any, ...]:
+    """Return `_evaluated` for stacks of times, states and responses."""
+    return jax.vmap(lambda point: _evaluated(problem, args, point, likes))(points)
+
+
+def _flat(tree: Tree) -> Slope:
+    """Return a tree of intervals as one vector of them."""
+    found = slopes(tree)
+    low, high = (
+        np.concatenate([getattr(v, end).ravel() for v in found]) for end in ("low", "high")
+    )
+    return interval(low, high)
+
+
+def _range(tree: Tree) -> Range:
+    """Return a tree of intervals as a stack of one row."""
+    flat = _flat(tree)
+    return Range(flat.low[None], flat.high[None])
