@@ -16,6 +16,7 @@ CASES = (
     "compile",
     "transforms",
     "certificate",
+    "bounds",
     "derivatives",
     "identification",
     "memory",
