@@ -284,6 +284,9 @@ def test_a_solution_in_parts_has_the_bound_of_the_whole(family):
     exact = dvax.solve(system, x0, 0.0, 4.0, ts=sol.ts, rtol=1e-12, atol=1e-12)
     assert (np.linalg.norm(np.asarray(sol.xs - exact.xs), axis=1) <= joined + 1e-11).all()
     assert joined.max() <= 2.0 * whole.max()
+    # With less work than that, the tolerance is larger, and the bound too.
+    half = BoundAlong(system, sol, 4.0, max_steps=follower.steps // 2)
+    assert half.bound(sol).x[-1] < np.inf and half.steps <= follower.steps // 2
     # No step is left for the parts behind a limit.
     short = BoundAlong(system, parts[0], 4.0, max_steps=100)
     assert np.isinf(short.bound(parts[0]).x[-1]) and "steps at t = " in short.why

@@ -58,7 +58,8 @@ class BoundAlong:
     """The bounds of a solution that is known part by part, from constants along it.
 
     **Arguments:** `sol`: its first part; `end`: the last time of the run; `initial_error`: a bound on
-    the error at its first one; `max_steps`: after so many steps of x_c the bound is infinite.
+    the error at its first one; `max_steps`: after so many steps of x_c the bound is infinite, and its
+    tolerance is larger if more are expected.
 
     **Raises:** `dvax.InputError` if the code of f and h proves no constants around the initial state.
     """
@@ -121,6 +122,10 @@ class BoundAlong:
             self.why = (
                 f"the trajectory along which it is proved had {self.steps} steps at t = {b:.6g}"
             )
+        elif self.max_steps < np.inf:
+            # Steps of order 2 are as long as the root of the tolerance.
+            expected = int(piece.sol.stats["steps"]) * (self.end - b) / (b - a)
+            self.tube.loosen((expected / (self.max_steps - self.steps + 1)) ** 2)
         self.unknown = 0 if piece.knows_law else self.unknown + 1
         if piece.excess(self.length, self.span, at_kink) < 0.25:
             self.length = min(2.0 * self.length, self.span / 8)

@@ -136,12 +136,17 @@ class Tube:
         self.weights = of_space(self.system.state, setup.x0)
         self.weights_u = of_space(self.system.control, self.system.u0)
         self.size = sum(map(np.size, jtu.tree_leaves(setup.x0)))
+        self.looseness = 1.0
         # Factor of the smallest reach of a tube, which the pieces adapt.
         self.limits_u, self.width = False, 1.0
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
         )
         self.first = self._first_constants(t0, end, sol.us)
+
+    def loosen(self, factor: float) -> None:
+        """Multiply the tolerances of x_c, which are between those of the solution and a hundredth."""
+        self.looseness = float(np.clip(factor * self.looseness, 1.0, 1.0 / _SHARPER))
 
     def _first_constants(self, t0: float, end: float, us: Tree) -> Constants:
         """Return constants around the initial state and the responses `us`, for the tolerance of laws
@@ -243,7 +248,8 @@ class Tube:
             x = jtu.tree_map(lambda rows: rows[-1], before.sol.xs)
             step = min(float(before.sol.stats["next_dt"]), nodes[-1] - a)
         return solve(
-            self.problem, x, a, nodes[-1], self.args, times, rtol=self.rtol, atol=self.atol,
+            self.problem, x, a, nodes[-1], self.args, times,
+            rtol=self.looseness * self.rtol, atol=self.looseness * self.atol,
             method=ETD2RK(), constants=self.first, dt0=step, horizon=self.span, throw=False,
         )  # fmt: skip
 
