@@ -280,14 +280,14 @@ def test_differences_lie_in_the_enclosures_of_many_boxes(seed):
 
 
 def test_an_oscillator_of_any_frequency_keeps_its_errors():
-    """Over a thousand steps of e'' = −ω²e the bound is that of the exact flow: nothing accumulates."""
+    """Over many steps of e'' = −ω²e the bound is that of the exact flow: nothing accumulates."""
     for frequency in (0.01, 1.0, 300.0):
         C = np.array([[0.0, 1.0], [-(frequency**2), 0.0]])
         linear = constant(C, np.zeros((2, 2)))
         error, step = ErrorEllipsoid.ball(1e-6, 2), np.array([0.37 / frequency])
-        for _ in range(1000):
+        for _ in range(200):
             error = propagate(linear, error, step, [0], disturbed(np.zeros(1))).ellipsoid
-        exact = 1e-6 * np.linalg.norm(scipy.linalg.expm(370.0 / frequency * C), 2)
+        exact = 1e-6 * np.linalg.norm(scipy.linalg.expm(74.0 / frequency * C), 2)
         assert error.norm == pytest.approx(exact, rel=1e-3)
 
 
