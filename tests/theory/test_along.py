@@ -293,6 +293,73 @@ def test_a_solution_in_parts_has_the_bound_of_the_whole(family):
     assert np.isinf(short.bound(parts[1]).x).all()
 
 
+@jax.custom_jvp
+def _ruled(x):
+    return jnp.tanh(x)
+
+
+@_ruled.defjvp
+def _zero(primals, tangents):
+    return _ruled(*primals), jnp.zeros_like(primals[0])
+
+
+@jax.custom_vjp
+def _ruled_backwards(x):
+    return jnp.tanh(x)
+
+
+_ruled_backwards.defvjp(lambda x: (_ruled_backwards(x), ()), lambda _, g: (jnp.zeros_like(g),))
+
+
+def _ruled_in_a_loop(x):
+    return jax.lax.fori_loop(0, 2, lambda _, v: 0.5 * (v + _ruled(x)), _ruled(x))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "growth", [jax.lax.stop_gradient, _ruled, _ruled_backwards, _ruled_in_a_loop, jax.nn.relu]
+)
+def test_derivative_rules_of_functions_do_not_change_a_bound(growth):
+    """x' = growth(x) near 0, where growth is x, and an error grows as e^t, whatever its derivative by
+    JAX is."""
+    system = problem(
+        lambda t, x, u, args: growth(x) + 0.0 * u, lambda t, x, u, args: -x[0],
+        dvax.sets.Box(-1.0, 1.0),
+    )  # fmt: skip
+    ts = np.linspace(0.0, 5.0, 6)[1:]
+    sol = dvax.solve(system, jnp.array([1e-3]), 0.0, 5.0, ts=ts)
+    other = dvax.solve(system, jnp.array([1e-3 + 1e-6]), 0.0, 5.0, ts=ts, rtol=1e-12, atol=1e-15)
+    bound = dvax.bound_error(system, sol, initial_error=1e-6)
+    apart = np.abs(np.asarray(other.xs - sol.xs)[:, 0])
+    assert (apart <= np.asarray(bound.x)).all() and apart[-1] > 1e-4
+    assert float(bound.x[-1]) < 2.0 * apart[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [3.0, 49.0])
+def test_a_response_at_its_bound_in_single_precision(scale):
+    """x' = −5(u − 1) with u = min(x, 1), where 1/P is rounded: from 1 + 1e-3 no state moves."""
+    limit = jnp.float32(scale)
+    system = dvax.Problem(
+        A=dvax.generators.Scalar(jnp.float32(0.0)), P=dvax.operators.Scaling(limit),
+        K=dvax.sets.Box(-limit, limit),
+        f=lambda t, x, u, args: -5.0 * (u - 1.0), h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    with jax.numpy_dtype_promotion("standard"):
+        sol = dvax.solve(system, jnp.ones(1, jnp.float32), 0.0, 4.0, ts=[1.0, 4.0], rtol=1e-3)
+        bound = dvax.bound_error(system, sol, initial_error=1e-3)
+    assert bound.x.dtype == jnp.float32 and 1e-3 <= float(bound.x[-1]) < 2e-3
+
+
+@pytest.mark.slow
+def test_a_part_that_has_its_start_alone_is_followed_by_the_next_one():
+    system, x0 = spring(40.0)
+    sol = dvax.solve(system, x0, 0.0, 4.0, ts=np.linspace(0.0, 4.0, 9))
+    follower = BoundAlong(system, sol, 4.0)
+    first, rest = (follower.bound(cut(sol, part)) for part in (slice(1), slice(1, None)))
+    assert float(first.x[0]) == 0.0 and float(rest.x.max()) < 1e-8
+
+
 @pytest.mark.slow
 def test_a_bound_in_single_precision():
     system, x0 = van_der_pol(1.0)

@@ -25,6 +25,7 @@ from ..generators import (
     Zero,
 )
 from ..problem import Problem
+from ..programs.own_derivatives import of_operations
 from ..programs.structure import analyse, independent
 from .flow import is_pointwise
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
@@ -265,7 +266,7 @@ def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) 
 
     def derivative(fn: Any, t: Any, x: Tree, u: Tree) -> Tree:
         along = jtu.tree_map(jnp.ones_like, (x, u))
-        return jax.jvp(lambda x, u: fn(t, x, u, args), (x, u), along)[1]
+        return jax.jvp(_plain(lambda x, u: fn(t, x, u, args), x, u), (x, u), along)[1]
 
     # One direction stands for all: the code is the same.
     return all(
@@ -360,10 +361,20 @@ def _derivatives(numbers: list[Any], signature: Signature) -> list[jax.Array]:
     kind = signature.options
     fx = lambda x: f(x, u) if kind == "without A" else _tree.add(A.apply(x), f(x, u))  # noqa: E731
     fns = (fx, x), (lambda u: f(x, u), u), (lambda x: h(x, u), x), (lambda u: h(x, u), u)
+    # What their values do decides on stability, and not a derivative rule of a part of them.
+    fns = [(_plain(fn, at), at) for fn, at in fns]
     if kind != "matrix":
         ones = lambda v: jtu.tree_map(jnp.ones_like, v)  # noqa: E731
         return [jax.jvp(fn, (at,), (ones(at),))[1].ravel() for fn, at in fns]
     return [_matrix(fn, at) for fn, at in fns]
+
+
+def _plain(fn: Any, *at: Any) -> Any:
+    """Return fn without the derivative rules of its parts, except in loops and branches."""
+    try:
+        return of_operations(fn, *at)
+    except NotImplementedError:
+        return fn
 
 
 def _is_affine(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:

@@ -81,6 +81,8 @@ class BoundAlong:
     def bound(self, sol: Solution) -> Bound:
         """Return the bound of the next part."""
         ts = np.asarray(sol.ts, float)
+        # A part may have its start alone.
+        start = self.t, self.before, self.length, self.unknown
         end = float(ts[-1]) if ts[-1] > self.t else self.end
         rows: list[_Row] = []
         statuses: list[Status] = []
@@ -97,6 +99,8 @@ class BoundAlong:
             if piece is not None:
                 rows += _rows(piece, saved)
                 statuses.append(piece.bound.status)
+        if not ts[-1] > start[0]:
+            self.t, self.before, self.length, self.unknown = start
         return _assembled(self.problem, sol, rows, statuses, self.why)
 
     def _next(self, b: float, saved: np.ndarray) -> Piece | None:

@@ -145,7 +145,7 @@ def propagate(
         mapped = {k: ErrorEllipsoid(maps[k] @ ellipsoid.B) for k in set(place[rows])}
         own = np.array([mapped[k].norm for k in place[rows]])
         bounds[rows] = own + of_rest / least + of_balls
-        largest = max(largest, float(top / least))
+        largest = float(np.maximum(largest, top / least))  # NaN included
         ellipsoid = mapped[place[end]].plus(float(of_balls[-1]), of_rest[-1] / scales)
         done = float(disturbed.completed[end])
     late = disturbed.late

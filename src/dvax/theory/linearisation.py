@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .. import _tree
 from ..programs.slope import TooLarge, Values
 from .blocks import Block, as_one_matrix, identity, norms
 from .local_derivatives import Derivatives, Range
@@ -31,7 +32,7 @@ MAX_UNKNOWNS = 128
 """Largest number of unknowns of x, and of u."""
 
 _SEPARATION = 1e-12
-"""Relative distance from which two numbers differ by more than rounding errors."""
+"""Relative distance from which two numbers differ by more than rounding errors, in double precision."""
 
 
 class Linearisation(NamedTuple):
@@ -112,7 +113,10 @@ def _response(
         inverse = np.linalg.inv(eye.center - product.center)
     except np.linalg.LinAlgError:
         return None
-    return P_inv.center @ inverse, G, product.radius, (low == high).all(axis=1)
+    # The inverse is rounded.
+    rest = np.abs(eye.center - inverse @ (eye.center - product.center))
+    T = product.radius + np.abs(eye.center - product.center) @ rest
+    return P_inv.center @ inverse, G, T, (low == high).all(axis=1)
 
 
 def _derivative_of_projection(
@@ -124,10 +128,11 @@ def _derivative_of_projection(
     low, high = ends
     # u is P⁻¹y with rounding errors, which must not look like a distance of y from its bounds.
     size = np.maximum(np.abs(u_low), np.abs(u_high))
-    half = (0.5 * (u_high - u_low) + _SEPARATION * size) @ np.abs(P).T
+    separation = max(_SEPARATION, 64.0 * float(np.finfo(_tree.dtype(system.u0)).eps))
+    half = (0.5 * (u_high - u_low) + separation * size) @ np.abs(P).T
     middle = (0.5 * (u_low + u_high)) @ P.T
     is_inside = (middle - half > root * low.high) & (middle + half < root * high.low)
-    apart = _SEPARATION * (size + np.maximum(np.abs(h_low), np.abs(h_high)))
+    apart = separation * (size + np.maximum(np.abs(h_low), np.abs(h_high)))
     is_at_end = (h_low - u_high > apart) | (h_high - u_low < -apart)
     return np.where(is_inside & ~is_at_end, 1.0, 0.0), np.where(is_at_end, 0.0, 1.0)
 

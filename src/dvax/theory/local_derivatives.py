@@ -23,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
+from ..programs.own_derivatives import of_operations
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, columns, interval
 from .blocks import Block, as_one_matrix
 from .projection_speed import slopes
@@ -46,7 +47,8 @@ class Range(NamedTuple):
 
 class Derivatives(NamedTuple):
     """∂f/∂x, ∂f/∂u, ∂h/∂x and ∂h/∂u in the norms of the spaces, as stacks with one matrix for each box;
-    the values there of u, of h, and of both ends of the box K(t), which are None if K is no box."""
+    the values there of u, of h, and of both ends of the box K(t), which are None if K is no box. u may
+    be outside K: its bounds are rounded, and must not hide that it is at one of them."""
 
     f_x: Block
     f_u: Block
@@ -57,8 +59,9 @@ class Derivatives(NamedTuple):
     ends: tuple[Range, Range] | None
 
 
-def of_region(system: System, region: Region) -> Derivatives | None:
-    """Return the derivatives over a region, as stacks of one matrix, or None if one is too large."""
+def of_region(system: System, region: Region, wide: Range | None = None) -> Derivatives | None:
+    """Return the derivatives over a region, as stacks of one matrix, or None if one is too large.
+    `wide`: the box of u before the bounds of K cut it."""
     J = system.at(region)
     blocks = J.f_x, J.f_u, J.h_x, J.h_u
     known = [b for b in blocks if b is not None]
@@ -73,7 +76,7 @@ def of_region(system: System, region: Region) -> Derivatives | None:
         (None, None) if bounds is None else (Range(b.low[None], b.high[None]) for b in bounds)
     )
     ends = None if low is None or high is None else (low, high)
-    return Derivatives(f_x, f_u, h_x, h_u, _range(region.u), _range(J.h), ends)
+    return Derivatives(f_x, f_u, h_x, h_u, wide or _range(region.u), _range(J.h), ends)
 
 
 class LocalDerivatives:
@@ -96,10 +99,17 @@ class LocalDerivatives:
         return self.n + self.k <= MAX_UNKNOWNS and self._enclosure is not None
 
     def at(
-        self, region: Region, t: Range, x: Range, u: Range, capacity: int = 0
+        self,
+        region: Region,
+        t: Range,
+        x: Range,
+        u: Range,
+        capacity: int = 0,
+        wide: Range | None = None,
     ) -> Derivatives | None:
         """Return the derivatives on boxes, whose bounds have a row each, inside the region; None if
-        they are not known. For all numbers of boxes up to the `capacity` one program is compiled."""
+        they are not known. For all numbers of boxes up to the `capacity` one program is compiled.
+        `wide`: the boxes of u before the bounds of K cut them."""
         if self._enclosure is None:
             return None
         try:
@@ -112,7 +122,10 @@ class LocalDerivatives:
         # In the precision of the evaluation, which may be single.
         dtype = jnp.result_type(float)
         centers = [(0.5 * (v.low + v.high)).astype(dtype).astype(float) for v in boxes]
-        halves = [np.maximum(v.high - c, c - v.low) for v, c in zip(boxes, centers, strict=True)]
+        halves = [
+            np.maximum(np.maximum(v.high - c, c - v.low), 0.0)
+            for v, c in zip(boxes, centers, strict=True)
+        ]
         count = len(centers[0])
         more = max(0, capacity - count)
         time, *others = (np.pad(c, ((0, more), (0, 0)), "edge") for c in centers)
@@ -140,7 +153,7 @@ class LocalDerivatives:
             )
         )
         box = (ends[0], ends[1]) if ends else None
-        return Derivatives(f_x, f_u, h_x, h_u, boxes[2], h, box)
+        return Derivatives(f_x, f_u, h_x, h_u, wide or boxes[2], h, box)
 
     @cached_property
     def _enclosure(self) -> SlopeEnclosure | None:
@@ -151,8 +164,8 @@ class LocalDerivatives:
                 lambda *point: _evaluated(system.problem, system.args, point, self.likes),
                 (jnp.zeros(()), *flat), (0, 1, 2),
             )  # fmt: skip
-        except NotImplementedError:  # a function without a derivative in forward mode
-            return None
+        except (NotImplementedError, TypeError, ValueError):
+            return None  # without derivatives, or those in forward mode
 
 
 def _evaluated(problem: Problem, args: Any, point: tuple[Any, ...], likes: Any) -> tuple[Any, ...]:
@@ -164,7 +177,8 @@ def _evaluated(problem: Problem, args: Any, point: tuple[Any, ...], likes: Any) 
         f, h = (fn(t, of_x(x), of_u(u), args) for fn in (problem.f, problem.h))
         return (ravel_pytree(f)[0], ravel_pytree(h)[0]), ravel_pytree(h)[0]
 
-    ((f_x, f_u), (h_x, h_u)), h = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(x, u)
+    plain = of_operations(both, x, u)
+    ((f_x, f_u), (h_x, h_u)), h = jax.jacfwd(plain, argnums=(0, 1), has_aux=True)(x, u)
     bounds = problem.set_at(t, args).intervals(likes[1])
     ends = () if bounds is None else tuple(ravel_pytree(end)[0] for end in bounds)
     return f_x, f_u, h_x, h_u, h, *ends

@@ -136,16 +136,16 @@ class Tube:
         self.weights = of_space(self.system.state, setup.x0)
         self.weights_u = of_space(self.system.control, self.system.u0)
         self.size = sum(map(np.size, jtu.tree_leaves(setup.x0)))
-        self.looseness = 1.0
-        # Factor of the smallest reach of a tube, which the pieces adapt.
-        self.limits_u, self.width = False, 1.0
+        # Factors of the tolerances of x_c, and of the smallest reach of a tube; and whether constants
+        # need bounds of u.
+        self.looseness, self.width, self.limits_u = 1.0, 1.0, False
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
         )
         self.first = self._first_constants(t0, end, sol.us)
 
     def loosen(self, factor: float) -> None:
-        """Multiply the tolerances of x_c, which are between those of the solution and a hundredth."""
+        """Multiply the tolerances of x_c, which are at most 100 times those that it starts with."""
         self.looseness = float(np.clip(factor * self.looseness, 1.0, 1.0 / _SHARPER))
 
     def _first_constants(self, t0: float, end: float, us: Tree) -> Constants:
@@ -241,7 +241,8 @@ class Tube:
         self, a: float, nodes: np.ndarray, saved: np.ndarray, before: Piece | None
     ) -> Solution:
         """Return x_c from a on, saved at the nodes, at the end of the piece the last one."""
-        times = np.unique(np.concatenate([nodes, saved]))
+        dtype = _tree.dtype(self.x0)
+        times = np.unique(np.concatenate([nodes, saved]).astype(dtype).astype(float))
         times = np.pad(times, (0, self.capacity - len(times)), "edge")
         x, step = self.x0, None
         if before is not None:
@@ -303,6 +304,10 @@ class Tube:
         if self.size > MAX_UNKNOWNS:
             return None
         disturbed, of_law = disturbances(self.problem, sol, constants)
+        # The integrals are sums of as many numbers as there are steps.
+        unit = int(sol.stats["steps"]) * float(jnp.finfo(sol.ts.dtype).eps)
+        rounded = disturbed.integral + unit * disturbed.integral[-1]
+        disturbed = disturbed._replace(integral=rounded)
         distances = reach, L * reach + float(np.max(of_law))
         region = self._around(sol, *distances, constants)
         if region is None:
@@ -358,13 +363,20 @@ class Tube:
                 least = np.minimum.reduceat(_flat_rows(low), firsts) - margin
                 most = np.maximum.reduceat(_flat_rows(high), firsts) + margin
                 low, high = (_flat_ends(whole, name) for name in ("low", "high"))
-                boxes.append(Range(np.maximum(least, low), np.minimum(most, high)))
+                boxes.append(
+                    (Range(np.maximum(least, low), np.minimum(most, high)), Range(least, most))
+                )
             times = Range(np.array([start, *ts[ends[:-1]]])[:, None], ts[ends][:, None])
-            J = self.local.at(region, times, boxes[0], boxes[1], self.capacity)
+            (x, _), (u, wide) = boxes
+            J = self.local.at(region, times, x, u, self.capacity, wide)
             linear = None if J is None else linearisation(self.system, J, L)
             if linear is not None:
                 return linear, ends
-        J = of_region(self.system, region)
+        assert sol.bounds is not None
+        least, most = (
+            _flat_rows(side, 0)[None] for side in _box(*sol.bounds.u, self.weights_u, of_u)
+        )
+        J = of_region(self.system, region, Range(least, most))
         return None if J is None else linearisation(self.system, J, L), [last]
 
     def _around(
