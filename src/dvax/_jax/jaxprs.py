@@ -89,8 +89,12 @@ def nested_programs(params: dict[str, Any]) -> list[Any]:
 def inner_program(eqn: Any) -> Any:
     """Return the program that a call applies to its arguments, or None for another operation.
 
-    A polynomial, which is one operation from JAX 0.12 on, counts as a call of Horner's scheme.
+    A polynomial, which is one operation from JAX 0.12 on, counts as a call of Horner's scheme, and so
+    does 1 − x², of the derivative of tanh.
     """
+    if eqn.primitive.name == "one_minus_square":
+        x = eqn.invars[0].aval
+        return _one_minus_square(x.shape, str(x.dtype))
     if eqn.primitive.name == "polynomial":
         return _horner(*((v.aval.shape, str(v.aval.dtype)) for v in eqn.invars))
     if eqn.primitive.name not in CALLS:
@@ -103,6 +107,11 @@ def inner_program(eqn: Any) -> Any:
         if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(eqn.invars):
             return inner
     return None
+
+
+@functools.lru_cache(64)
+def _one_minus_square(shape: tuple[int, ...], dtype: str) -> Any:
+    return jax.make_jaxpr(lambda x: 1.0 - x * x)(jax.ShapeDtypeStruct(shape, dtype))
 
 
 @functools.lru_cache(64)

@@ -66,7 +66,7 @@ class BoundAlong:
 
     def __init__(
         self, problem: Problem, sol: Solution, end: float, initial_error: float = 0.0,
-        max_steps: float = np.inf,
+        max_steps: int | None = None,
     ):  # fmt: skip
         self.problem = problem = current(problem)
         self.end, self.initial_error = end, initial_error
@@ -122,11 +122,11 @@ class BoundAlong:
         if piece.x[-1] > _USELESS * (1.0 + size):
             self.why = f"at t = {b:.6g} it has grown to {_USELESS:.0g} times the solution"
             return None
-        if self.steps > self.max_steps:
+        if self.max_steps is not None and self.steps > self.max_steps:
             self.why = (
                 f"the trajectory along which it is proved had {self.steps} steps at t = {b:.6g}"
             )
-        elif self.max_steps < np.inf:
+        elif self.max_steps is not None:
             # Steps of order 2 are as long as the root of the tolerance.
             expected = int(piece.sol.stats["steps"]) * (self.end - b) / (b - a)
             self.tube.loosen((expected / (self.max_steps - self.steps + 1)) ** 2)
