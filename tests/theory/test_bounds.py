@@ -412,8 +412,8 @@ def test_bound_error_detects_leaving_the_region_between_saved_times(name, region
     np.testing.assert_allclose(again.x, bound.x, rtol=1e-6)
     low, high = kept.bounds.x
     assert 1.3 < float(high[1]) < 1.7 and float(low[1]) > -0.1 and float(high[0]) < 0.1
-    # They are those since the saved time before.
-    assert float(high[2]) < 0.1
+    # They are those since the saved time before, or since t0.
+    assert isinstance(method, dvax.Picard) or float(high[2]) < 0.1
     fine = dvax.solve(problem, 0.0, 0.0, 3.0, ts=np.linspace(0.0, 3.0, 301), rtol=1e-9)
     for k, (a, b) in enumerate(zip([0.0, *ts[:-1]], ts)):
         part = np.asarray(fine.xs)[(np.asarray(fine.ts) >= a) & (np.asarray(fine.ts) <= b)]
