@@ -25,7 +25,7 @@ from ..generators import (
     Zero,
 )
 from ..problem import Problem
-from ..programs.own_derivatives import of_operations
+from ..programs.derivatives_of_operations import of_operations
 from ..programs.structure import analyse, independent
 from .flow import is_pointwise
 from .method import ETD2RK, ETD4RK, ExpRosenbrock

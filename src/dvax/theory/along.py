@@ -2,7 +2,7 @@
 
 Constants of the whole space may not exist, and those of a region around a whole trajectory are large:
 errors then seem to grow everywhere as fast as they do in the worst place. Here time is cut into pieces,
-and each piece has the constants and the derivatives of a tube around the trajectory on it.
+and each piece has the constants and the derivatives of a tube around the trajectory on it (`tube`).
 
 Let x_c be computed on [a, b] with an enclosed defect, and let an ellipsoid contain x_c(a) − x(a). It is
 mapped along the linearised system (`linearisation`, `error_ellipsoid`), if that proves that x stays in

@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
-from ..programs.own_derivatives import of_operations
+from ..programs.derivatives_of_operations import of_operations
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, columns, interval
 from .blocks import Block, as_one_matrix
 from .projection_speed import slopes
