@@ -18,6 +18,7 @@ e^{∫(ω + ML̃)}, which M multiplies once.
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -28,6 +29,7 @@ from .._captured import current
 from .._tree import Tree
 from ..evolution import Solution
 from ..problem import Problem
+from ..spaces import AbstractSpace
 from .certificate import Bound
 from .status import Status, weakest
 from .tube import MAX_SAVED, Piece, Tube
@@ -47,32 +49,38 @@ _USELESS = 1e6
 
 
 class _Row(NamedTuple):
-    """x_c and its response at a saved time with their bounds: those of `Bound`, in its order."""
+    """x_c and its response at a saved time with their bounds, those of `Bound` in its order, and what
+    they rest on."""
 
     x: Tree
     u: Tree
     bounds: tuple[Any, ...]
+    status: Status
 
 
 class BoundAlong:
     """The bounds of a solution that is known part by part, from constants along it.
 
-    **Arguments:** `sol`: its first part; `end`: the last time of the run; `initial_error`: a bound on
-    the error at its first one; `max_steps`: after so many steps of x_c the bound is infinite, and its
-    tolerance is larger if more are expected.
+    **Arguments:** `sol`: its first part; `times`: the saved times of all parts, since pieces may be
+    longer than parts; `end`: the last time of the run; `initial_error`: a bound on the error at its
+    first one; `max_steps`: after so many steps of x_c the bound is infinite, and its tolerance is
+    larger if more are expected.
 
     **Raises:** `dvax.InputError` if the code of f and h proves no constants around the initial state.
     """
 
     def __init__(
-        self, problem: Problem, sol: Solution, end: float, initial_error: float = 0.0,
-        max_steps: int | None = None,
+        self, problem: Problem, sol: Solution, times: np.ndarray, end: float,
+        initial_error: float = 0.0, max_steps: int | None = None,
     ):  # fmt: skip
         self.problem = problem = current(problem)
-        self.end, self.initial_error = end, initial_error
         self.t = float(sol.setup.setting["t0"])
-        self.span = end - self.t
-        self.tube = Tube(problem, sol, self.t, end)
+        # In the precision of the solution, to which a saved time is one of these.
+        self.times = np.unique(times.astype(sol.ts.dtype)).astype(float)
+        self.end, self.initial_error = max(end, float(self.times[-1])), initial_error
+        self.rows: dict[float, _Row] = {}
+        self.span = self.end - self.t
+        self.tube = Tube(problem, sol, self.t, self.end)
         self.length, self.why = self.span / _FIRST_PIECES, ""
         self.before: Piece | None = None
         self.unknown = 0  # pieces in a row with an unknown derivative of the law
@@ -81,27 +89,26 @@ class BoundAlong:
     def bound(self, sol: Solution) -> Bound:
         """Return the bound of the next part."""
         ts = np.asarray(sol.ts, float)
-        # A part may have its start alone.
-        start = self.t, self.before, self.length, self.unknown
-        end = float(ts[-1]) if ts[-1] > self.t else self.end
-        rows: list[_Row] = []
-        statuses: list[Status] = []
-        while len(rows) < len(ts) and not self.why:
-            left = ts[len(rows) :]
-            b = min(self.t + self.length, end)
-            b = end if end - b < 1e-3 * self.length else b
-            # More saved times than a piece has room for end it; one of them may be its start.
-            different = np.unique(left)
-            b = min(b, different[MAX_SAVED - 1]) if len(different) > MAX_SAVED else b
-            # A saved time at the start belongs to the piece.
-            saved = left[: np.searchsorted(left, b, side="right")]
-            piece = self._next(b, saved)
-            if piece is not None:
-                rows += _rows(piece, saved)
-                statuses.append(piece.bound.status)
-        if not ts[-1] > start[0]:
-            self.t, self.before, self.length, self.unknown = start
-        return _assembled(self.problem, sol, rows, statuses, self.why)
+        while ts[-1] not in self.rows and not self.why:
+            self._advance()
+        found = [self.rows[t] for t in ts if t in self.rows]
+        # The next part may have the last time of this one again.
+        self.rows = {t: row for t, row in self.rows.items() if t >= ts[-1]}
+        return _assembled(self.problem, sol, found, self.why if len(found) < len(ts) else "")
+
+    def _advance(self) -> None:
+        """Add the rows of the next piece, which has all saved times since the end of the one before."""
+        assert self.t < self.end
+        # A saved time at the start belongs to the first piece.
+        left = self.times[self.times > self.t if self.before else self.times >= self.t]
+        b = min(self.t + self.length, self.end)
+        b = self.end if self.end - b < 1e-3 * self.length else b
+        # More saved times than a piece has room for end it.
+        b = min(b, left[MAX_SAVED - 1]) if len(left) > MAX_SAVED else b
+        saved = left[: np.searchsorted(left, b, side="right")]
+        piece = self._next(b, saved)
+        if piece is not None:
+            self.rows |= dict(zip(saved.tolist(), _rows(piece, saved), strict=True))
 
     def _next(self, b: float, saved: np.ndarray) -> Piece | None:
         """Return the next piece, if it may end at b; otherwise make it shorter, or say why there is
@@ -144,7 +151,8 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
     """
     t0, t1 = (float(sol.setup.setting[name]) for name in ("t0", "t1"))
     last = float(sol.ts[-1])
-    return BoundAlong(problem, sol, last if last > t0 else t1, initial_error).bound(sol)
+    end = last if last > t0 else t1
+    return BoundAlong(problem, sol, np.asarray(sol.ts), end, initial_error).bound(sol)
 
 
 def _last(rows: Tree) -> Tree:
@@ -162,14 +170,13 @@ def _rows(piece: Piece, saved: np.ndarray) -> list[_Row]:
             jtu.tree_map(row(k), piece.sol.xs),
             jtu.tree_map(row(k), piece.sol.us),
             tuple(float(column[k]) for column in columns),
+            bound.status,
         )
         for k in at
     ]
 
 
-def _assembled(
-    problem: Problem, sol: Solution, rows: list[_Row], statuses: list[Status], why: str
-) -> Bound:
+def _assembled(problem: Problem, sol: Solution, rows: list[_Row], why: str) -> Bound:
     """Return the bounds of x_c with the distance of the solution from it, infinite after the rows."""
     count, found = len(sol.ts), len(rows)
     bounds = np.full((6, count), np.inf)
@@ -179,12 +186,18 @@ def _assembled(
             lambda *leaves: jnp.asarray(np.stack(leaves)), *(getattr(row, name) for row in rows)
         )
         first = lambda tree: jtu.tree_map(lambda leaf: leaf[:found], tree)  # noqa: E731
-        of_x = jax.vmap(state.norm)(_tree.sub(first(sol.xs), stacked("x")))
-        of_u = jax.vmap(control.norm)(_tree.sub(first(sol.us), stacked("u")))
+        of_x = _distances(state, first(sol.xs), stacked("x"))
+        of_u = _distances(control, first(sol.us), stacked("u"))
         distances = np.stack([np.asarray(of_x), np.asarray(of_u)] * 3)
         bounds[:, :found] = np.array([row.bounds for row in rows]).T + distances
+    status: Status = weakest(*[row.status for row in rows]) if rows else "estimated"
     x, u, x_paper, u_paper, x_sharp, u_sharp = (jnp.asarray(v, sol.ts.dtype) for v in bounds)
     return Bound(
-        sol.ts, x, u, x_paper, u_paper, x_sharp, u_sharp, weakest(*statuses) if statuses else
-        "estimated", None, why,
+        sol.ts, x, u, x_paper, u_paper, x_sharp, u_sharp,
+        status, None, why,
     )  # fmt: skip
+
+
+@eqx.filter_jit
+def _distances(space: AbstractSpace, rows: Tree, others: Tree) -> jax.Array:
+    return jax.vmap(space.norm)(_tree.sub(rows, others))

@@ -170,7 +170,9 @@ class PythonApplication(AbstractModelApplication):
         if before is None:
             steps = self.table.bound_steps
             try:
-                self.follower = BoundAlong(self.own.problem, piece, self.t_end, max_steps=steps)
+                self.follower = BoundAlong(
+                    self.own.problem, piece, self.times, self.t_end, max_steps=steps
+                )
             except InputError as error:
                 self.follower = error.problems[0].rule
         if isinstance(self.follower, BoundAlong):
