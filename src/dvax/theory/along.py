@@ -190,7 +190,8 @@ def _assembled(problem: Problem, sol: Solution, rows: list[_Row], why: str) -> B
         of_u = _distances(control, first(sol.us), stacked("u"))
         distances = np.stack([np.asarray(of_x), np.asarray(of_u)] * 3)
         bounds[:, :found] = np.array([row.bounds for row in rows]).T + distances
-    status: Status = weakest(*[row.status for row in rows]) if rows else "estimated"
+    statuses: list[Status] = [row.status for row in rows]
+    status = weakest(*statuses) if statuses else "estimated"
     x, u, x_paper, u_paper, x_sharp, u_sharp = (jnp.asarray(v, sol.ts.dtype) for v in bounds)
     return Bound(
         sol.ts, x, u, x_paper, u_paper, x_sharp, u_sharp,
