@@ -190,9 +190,7 @@ def test_report_is_the_same_each_time(tmp_path: Path) -> None:
 def test_report_folds_its_tables_and_links_to_every_part(large: Path) -> None:
     text = (large / "report.html").read_text(encoding="utf-8")
     folded = re.findall(r'<details id="([^"]*)"><summary>([^<]*)', text)
-    assert [title.strip() for _, title in folded] == [
-        *("Figures", "Constants", "Configuration", "Provenance")
-    ]
+    assert [title.strip() for _, title in folded] == [*("Constants", "Configuration", "Provenance")]
     assert "<details open" not in text
     links = re.findall(r'<a href="#([^"]*)">', text)
     assert links == re.findall(r'<(?:section|details) id="([^"]*)"', text)

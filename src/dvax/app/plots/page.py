@@ -24,12 +24,12 @@ from dvax.app.plots.tables import (
 )
 from dvax.app.plots.theme import counted
 
-_HINTS = """<p class="hint">Drag in a figure to zoom; figures over the same axis follow. Double-click to
-return.</p>
-<noscript><p class="banner">The figures need JavaScript. The folder figures holds them as
+_HINTS = """<p class="hint">Drag in a picture to zoom; pictures over the same axis follow. Double-click
+to return.</p>
+<noscript><p class="banner">The pictures need JavaScript. The folder figures holds them as
 PNG.</p></noscript>
-<p class="banner" id="old-browser" hidden>This browser cannot unpack the figures. Update it, or open the
-PNG files in the folder figures.</p>"""
+<p class="banner" id="old-browser" hidden>This browser cannot unpack the pictures. Update it, or open
+the PNG files in the folder figures.</p>"""
 # The browser refuses every request of the page. Plotly compiles its parallel axes ('unsafe-eval').
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
@@ -51,11 +51,10 @@ class Part(NamedTuple):
 def page(run: RunRecord, pictures: Sequence[Picture], missing: Sequence[str]) -> str:
     """The whole HTML text. `missing` says, a sentence each, which pictures the run cannot give."""
     absent = "".join(f"<li>{escaped(text)}</li>" for text in missing)
-    figures = len(run.summary) - ("status" in run.summary)
     parts = [
         *sections(pictures),
         *section("missing", "Not drawn", f"<ul>{absent}</ul>" if absent else ""),
-        *fold("figures", "Figures", figures_table(run), figures),
+        *section("figures", "Key figures", figures_table(run)),
         *fold("certificate", "Assumptions and rates", _stability(run), len(run.assumptions)),
         *fold("constants", "Constants", _constants(run), len(run.constants)),
         *fold("configuration", "Configuration", _configuration(run)),

@@ -1,4 +1,4 @@
-// Zoom: figures over the same axis, such as time, are zoomed together.
+// Zoom: pictures over the same axis, such as time, are zoomed together.
 
 const axesOf = (figure, letter) =>
   Object.keys(figure.layout).filter((key) => key.startsWith(`${letter}axis`));
