@@ -1,4 +1,5 @@
-"""`python -m benchmarks [--full] [--only NAME ...] [--save [FILE]]`, from the repository's root."""
+"""`python -m benchmarks [--full] [--only NAME ...] [--part K/N] [--save [FILE]]`, from the root of the
+repository."""
 
 import argparse
 import dataclasses
@@ -36,9 +37,8 @@ def main() -> None:
     started = time.perf_counter()
     sections: list[Section] = []
     loads: list[str] = []
-    for name in CASES:
-        if options.only and name not in options.only:
-            continue
+    names = _names(options)
+    for name in names:
         loads.append(machine.load())
         sections.append(load(name)(options.full))
         print(f"\n{as_text(sections[-1])}\n(load at its start: {loads[-1]})", flush=True)
@@ -47,7 +47,6 @@ def main() -> None:
     print(f"\nTargets\n-------\n{verdicts(sections)}")
     print(f"\n{facts['seconds']} s; load afterwards: {facts['load after']}")
     if options.save:
-        names = [name for name in CASES if not options.only or name in options.only]
         content = {
             "date": datetime.datetime.now().isoformat(timespec="seconds"),
             "machine": facts,
@@ -61,12 +60,20 @@ def main() -> None:
         print(f"Saved as {options.save}")
 
 
+def _names(options: argparse.Namespace) -> list[str]:
+    k, n = map(int, options.part.split("/"))
+    return [name for name in CASES if not options.only or name in options.only][k - 1 :: n]
+
+
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", description="dvax against the peers that are found here."
     )
     parser.add_argument("--full", action="store_true", help="more rounds, longer runs, memory")
     parser.add_argument("--only", action="append", choices=CASES, help="this case (repeatable)")
+    parser.add_argument(
+        "--part", default="1/1", metavar="K/N", help="every N-th case, from number K on"
+    )
     where = re.sub(r"\W+", "-", platform.node() or "machine").strip("-")
     default = _RESULTS / f"{datetime.datetime.now():%Y-%m-%dT%H%M}-{where}.json"
     parser.add_argument(

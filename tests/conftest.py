@@ -60,6 +60,7 @@ if os.environ.get("DVAX_CHECK_ANNOTATIONS"):
     )
 
 import jax  # noqa: E402  (its settings come from the lines above)
+from tests.selection import part_of  # noqa: E402
 
 # In this process alone: the command line has to ask for double precision by itself, and an
 # environment variable would hide it if it forgot.
@@ -76,6 +77,19 @@ hypothesis.settings.register_profile(
     "thorough", deadline=None, max_examples=100_000, print_blob=True
 )
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "test"))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--part", default="1/1", help="k/n: every n-th of the tests, from number k on")
+
+
+@pytest.hookimpl(trylast=True)  # after the selection by marks
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    chosen = part_of(items, config.getoption("--part"))
+    if len(chosen) < len(items):
+        kept = set(chosen)
+        config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+        items[:] = chosen
 
 
 _MAPPED, _PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")

@@ -1,6 +1,7 @@
 """Selection of cases: those of `make test`, and those of `make thorough`, which ends within hours."""
 
 import os
+import re
 from collections.abc import Collection, Iterable, Sequence, Set
 from typing import Any
 
@@ -31,3 +32,14 @@ def spread(cases: Sequence[Any], number: int) -> list[Any]:
     if os.environ.get("DVAX_ALL_CASES") == "1":
         return list(cases)
     return [cases[k * len(cases) // number] for k in range(number)]
+
+
+def part_of(items: Sequence[Any], part: str) -> list[Any]:
+    """Part "k/n" of the items: every n-th from number k on, so that each has cases of all families.
+
+    **Raises:** `pytest.UsageError` unless 1 <= k <= n."""
+    found = re.fullmatch(r"(\d+)/(\d+)", part)
+    k, n = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not 1 <= k <= n:
+        raise pytest.UsageError(f"--part {part}: write k/n with 1 <= k <= n, such as 2/8")
+    return list(items[k - 1 :: n])
