@@ -31,6 +31,10 @@ _COUPLING = 1e-3
 """Relative size of the entries that are added to C for its scales, so that none is without limit."""
 
 
+_INFINITE = np.errstate(over="ignore", invalid="ignore")
+"""Bounds may be infinite, or NaN where infinity was multiplied by 0, which stand for no bound."""
+
+
 class ErrorEllipsoid(NamedTuple):
     """Errors e = Bz with ‖z‖ ≤ 1."""
 
@@ -45,6 +49,7 @@ class ErrorEllipsoid(NamedTuple):
         """The largest ‖e‖."""
         return _norm(self.B) * (1.0 + _ROUNDING * len(self.B))
 
+    @_INFINITE
     def plus(self, radius: float, semiaxes: Values = 0.0) -> "ErrorEllipsoid":
         """Return an ellipsoid that contains all sums of an error, of one of norm ≤ `radius`, and of one
         {Mz: ‖z‖ ≤ 1} with M the diagonal matrix of these `semiaxes`.
@@ -100,6 +105,7 @@ class Propagated(NamedTuple):
         return ErrorEllipsoid.ball(radius, len(self.scales)) if is_smaller else self.ellipsoid
 
 
+@_INFINITE
 def propagate(
     linear: Linearisation, start: ErrorEllipsoid, times: Values, ends: Sequence[int],
     disturbed: Disturbances,
@@ -136,10 +142,9 @@ def propagate(
         size = float(np.linalg.norm(ellipsoid.B))
         added = np.maximum(disturbed.integral[rows] - done, 0.0) + rounding * size
         begin = ErrorEllipsoid(scales[:, None] * ellipsoid.B).norm
-        with np.errstate(over="ignore", invalid="ignore"):
-            top = m_scaled[j] * (begin + most * added[-1]) * np.exp(shares[j])
-            of_rest = m_scaled[j] * rest[j] * until * top
-            of_balls = m[j] * added
+        top = m_scaled[j] * (begin + most * added[-1]) * np.exp(shares[j])
+        of_rest = m_scaled[j] * rest[j] * until * top
+        of_balls = m[j] * added
         if 4.0 * m_scaled[j] < m[j]:  # a ball of the scaled norm is longer in some directions
             of_rest, of_balls = of_rest + m_scaled[j] * most * added, np.zeros(len(added))
         mapped = {k: ErrorEllipsoid(maps[k] @ ellipsoid.B) for k in set(place[rows])}
