@@ -1,10 +1,19 @@
 """Data as functions of time, with knots at which steps must end."""
 
-from .abstract import AbstractSignal as AbstractSignal
-from .abstract import SignalReports as SignalReports
-from .abstract import listen as listen
-from .constant import Constant as Constant
-from .function import Function as Function
-from .given import as_signal as as_signal
-from .product import Product as Product
-from .table import Table as Table
+from .abstract import AbstractSignal, SignalReports, listen
+from .constant import Constant
+from .function import Function
+from .given import as_signal
+from .product import Product
+from .table import Table
+
+__all__ = [
+    "AbstractSignal",
+    "Constant",
+    "Function",
+    "Product",
+    "SignalReports",
+    "Table",
+    "as_signal",
+    "listen",
+]

@@ -1,6 +1,13 @@
 """Hilbert spaces, with the inner products of norms, adjoints, projections and constants."""
 
-from .abstract import AbstractSpace as AbstractSpace
-from .euclidean import Euclidean as Euclidean
-from .l2 import L2 as L2
-from .product import Product as Product
+from .abstract import AbstractSpace
+from .euclidean import Euclidean
+from .l2 import L2
+from .product import Product
+
+__all__ = [
+    "L2",
+    "AbstractSpace",
+    "Euclidean",
+    "Product",
+]

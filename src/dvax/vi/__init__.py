@@ -1,31 +1,50 @@
 """The frozen variational inequality VI(K, F): solvers, residuals, certificates, derivatives."""
 
-from ..programs.structure import Structure as Structure
-from ..programs.structure import analyse as analyse
-from ..programs.structure import independent as independent
-from .abstract import RESULTS as RESULTS
-from .abstract import AbstractSolver as AbstractSolver
-from .abstract import Answer as Answer
-from .abstract import FrozenVI as FrozenVI
-from .accelerated import Accelerated as Accelerated
-from .active_set import ActiveSet as ActiveSet
-from .auto import Auto as Auto
-from .auto import ClosedForm as ClosedForm
-from .bracketing import Bracketing as Bracketing
-from .certificate import Certificate as Certificate
-from .certificate import certify as certify
-from .certificate import natural_residual as natural_residual
-from .certificate import residual_bound as residual_bound
-from .extragradient import Extragradient as Extragradient
-from .forward_backward_forward import ForwardBackwardForward as ForwardBackwardForward
-from .golden_ratio import GoldenRatio as GoldenRatio
-from .lemke import Lemke as Lemke
-from .projection import Projection as Projection
-from .refute import Counterexample as Counterexample
-from .refute import refute_gamma as refute_gamma
-from .semismooth_newton import SemismoothNewton as SemismoothNewton
-from .solve import VISolution as VISolution
-from .solve import default_space as default_space
-from .solve import solve_vi as solve_vi
-from .weighted import Modulus as Modulus
-from .weighted import Weighted as Weighted
+from ..programs.structure import Structure, analyse, independent
+from .abstract import RESULTS, AbstractSolver, Answer, FrozenVI
+from .accelerated import Accelerated
+from .active_set import ActiveSet
+from .auto import Auto, ClosedForm
+from .bracketing import Bracketing
+from .certificate import Certificate, certify, natural_residual, residual_bound
+from .extragradient import Extragradient
+from .forward_backward_forward import ForwardBackwardForward
+from .golden_ratio import GoldenRatio
+from .lemke import Lemke
+from .projection import Projection
+from .refute import Counterexample, refute_gamma
+from .semismooth_newton import SemismoothNewton
+from .solve import VISolution, default_space, solve_vi
+from .weighted import Modulus, Weighted
+
+__all__ = [
+    "RESULTS",
+    "AbstractSolver",
+    "Accelerated",
+    "ActiveSet",
+    "Answer",
+    "Auto",
+    "Bracketing",
+    "Certificate",
+    "ClosedForm",
+    "Counterexample",
+    "Extragradient",
+    "ForwardBackwardForward",
+    "FrozenVI",
+    "GoldenRatio",
+    "Lemke",
+    "Modulus",
+    "Projection",
+    "SemismoothNewton",
+    "Structure",
+    "VISolution",
+    "Weighted",
+    "analyse",
+    "certify",
+    "default_space",
+    "independent",
+    "natural_residual",
+    "refute_gamma",
+    "residual_bound",
+    "solve_vi",
+]
