@@ -189,15 +189,24 @@ def current(part: Part) -> Part:
 
 
 class Reads:
-    """The values that the functions of a problem of `current` read, to be compared with others."""
+    """The code of a problem of `current`, its arrays, and the values that its functions read, to be
+    compared with those of others. Arrays that are traced count as equal to all."""
 
     def __init__(self, part: Any):
-        leaves = jtu.tree_leaves(part)
-        captured = (v for v in leaves if isinstance(v, _Captured))
+        leaves, self.structure = jtu.tree_flatten(part)
+        captured = [v for v in leaves if isinstance(v, _Captured)]
         self.functions: tuple[Any, ...] = tuple(v for v in captured if v.key or _written(v.fn))
+        self.rest: tuple[Any, ...] | None = tuple(captured)
+        self.arrays = tuple(_kept(v) for v in leaves if not isinstance(v, _Captured))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Reads) and other.functions == self.functions
+        if not isinstance(other, Reads) or other.functions != self.functions:
+            return False
+        if self.rest is None or other.rest is None:
+            return True  # one of them was stored, and code is not
+        if self.rest != other.rest or self.structure != other.structure:
+            return False
+        return all(map(_are_equal, self.arrays, other.arrays))
 
     def __hash__(self) -> int:
         return hash(self.functions)
@@ -206,9 +215,22 @@ class Reads:
         return _stored, (bool(self.functions),)
 
 
+def _kept(value: Any) -> Any:
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def _are_equal(one: Any, other: Any) -> bool:
+    if not _tree.is_concrete(one, other):
+        return True
+    if eqx.is_array_like(one) and eqx.is_array_like(other):
+        return np.shape(one) == np.shape(other) and bool(np.array_equal(one, other))
+    return bool(one == other)
+
+
 def _stored(is_known: bool) -> Reads:
     """Return what was read before it was stored: values are not stored, and equal no others."""
     found = Reads(None)
+    found.rest = None
     found.functions = (_Same(object()),) if is_known else ()
     return found
 

@@ -38,6 +38,15 @@ def merge(listed: list[Any], t0: Any, t1: Any) -> Any:
     return jnp.sort(jnp.where(_is_distinct(merged), merged, t1))
 
 
+def near_ends(listed: list[Any], t0: float, t1: float, eps: float) -> list[float]:
+    """Return the known knots inside (t0, t1) that are no rounded ends, and as close to one as if they
+    were: steps do not end there, and a jump at such a time is missed."""
+    known = [np.ravel(np.asarray(knots, float)) for knots in listed if _tree.is_concrete(knots)]
+    knots = np.unique(np.concatenate([np.zeros(0), *known]))
+    gaps = np.minimum(knots - t0, t1 - knots) / (eps * max(abs(t0), abs(t1), 1e-300))
+    return knots[(gaps > KNOT_ULPS) & (gaps <= END_ULPS)].tolist()
+
+
 def _is_distinct(knots: Any) -> Any:
     """Return which sorted times differ from the previous one by more than roundoff."""
     lib = np if _tree.is_concrete(knots) else jnp

@@ -242,7 +242,14 @@ def host(a: Tree) -> Tree:
     """Return the tree with concrete leaves as NumPy arrays.
 
     NumPy is faster for few numbers: JAX compiles every operation on concrete values separately."""
-    return jtu.tree_map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, a)
+    return jtu.tree_map(
+        lambda leaf: np.asarray(leaf) if is_concrete(leaf) and not is_key(leaf) else leaf, a
+    )
+
+
+def is_key(leaf: Any) -> bool:
+    """Return whether a leaf is a random key of JAX, which is no array of NumPy."""
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def array_module(*values: Tree) -> Any:

@@ -290,7 +290,7 @@ def test_a_solution_in_parts_has_the_bound_of_the_whole(family):
     assert half.bound(sol).x[-1] < np.inf and half.steps <= follower.steps // 2
     # No step is left for the parts behind a limit.
     short = BoundAlong(system, parts[0], np.asarray(sol.ts), 4.0, max_steps=100)
-    assert np.isinf(short.bound(parts[0]).x[-1]) and "steps at t = " in short.why
+    assert np.isinf(short.bound(parts[0]).x[-1]) and "steps to t = " in short.why
     assert np.isinf(short.bound(parts[1]).x).all()
 
 

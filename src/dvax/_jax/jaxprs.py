@@ -109,6 +109,12 @@ def inner_program(eqn: Any) -> Any:
     return None
 
 
+def applies_function(eqn: Any) -> bool:
+    """Return whether an operation replaces entries by a function of them, `x.at[i].apply(fn)`: a
+    scatter, as that which writes given values, but with a program."""
+    return eqn.primitive.name == "scatter" and eqn.params.get("update_jaxpr") is not None
+
+
 @functools.lru_cache(64)
 def _one_minus_square(shape: tuple[int, ...], dtype: str) -> Any:
     return jax.make_jaxpr(lambda x: 1.0 - x * x)(jax.ShapeDtypeStruct(shape, dtype))

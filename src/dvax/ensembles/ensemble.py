@@ -206,11 +206,13 @@ def _ensemble(
             continue
         before = kept.take(members)
         collect(kept, program(other), inputs, members, devices)
-        solved = np.ones(len(members), bool)
-        if result == RESULTS.step_too_small:
-            # Where the other method fails too, the first failure is reported.
-            solved = ~kept.rows.failed[members]
-            kept.put(members[~solved], jtu.tree_map(lambda rows, s=solved: rows[~s], before))
+        # Where the other method fails too, the first failure is reported, or another one is tried.
+        solved = ~kept.rows.failed[members]
+        if result == RESULTS.stiff:
+            # A method that stability limits may need more steps than there may be.
+            solved |= np.asarray(kept.rows.result == RESULTS.max_steps)[members]
+            solved |= other.method is choice.method
+        kept.put(members[~solved], jtu.tree_map(lambda rows, s=solved: rows[~s], before))
         if solved.any():
             switched[members[solved]] = True
             count = f"{solved.sum()} member" + ("" if solved.sum() == 1 else "s")

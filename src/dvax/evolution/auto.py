@@ -25,7 +25,7 @@ from ..generators import (
     Zero,
 )
 from ..problem import Problem
-from ..programs.derivatives_of_operations import of_operations
+from ..programs.derivatives_of_operations import has_derivative, of_operations
 from ..programs.structure import analyse, independent
 from .flow import is_pointwise
 from .method import ETD2RK, ETD4RK, ExpRosenbrock
@@ -95,7 +95,11 @@ class Choice(NamedTuple):
         """Return what to try, in this order, after a run of the method that ended with `result`."""
         first = type(self.method).__name__
         if result == RESULTS.stiff:
-            return [Choice(self.fallback, f"stability limited the steps of {first}")]
+            other = type(self.fallback).__name__
+            return [
+                Choice(self.fallback, f"stability limited the steps of {first}"),
+                Choice(self.method, f"{self.reason}, and {other} failed"),
+            ]
         if result != RESULTS.step_too_small or isinstance(self.method, ETD2RK):
             return []
         # The defect of ETD2RK is zero where f̃ is a line in t, however steep, and enclosed elsewhere.
@@ -108,7 +112,7 @@ class Facts(NamedTuple):
     """What the code of a problem proves, whatever its numbers: `affine` says that f and h are affine in
     (t, x, u) jointly and the bounds of K in t, so that x' is affine from kink to kink; `pointwise`,
     that f̃ acts entry by entry, and `diagonal`, that A does too; `linear`, that the derivatives of f
-    and h in x and u are constant."""
+    and h in x and u are constant; and `derivable`, that JAX has these derivatives."""
 
     state: int
     law: int
@@ -116,6 +120,7 @@ class Facts(NamedTuple):
     pointwise: bool
     diagonal: bool
     linear: bool
+    derivable: bool
 
     @property
     def is_field(self) -> bool:
@@ -180,7 +185,7 @@ def choose(
 
 
 def _with_fallback(method: Any, reason: str, facts: Facts, tol: float) -> Choice:
-    if not (facts.diagonal or facts.state <= _LINEARISABLE):
+    if not facts.derivable or not (facts.diagonal or facts.state <= _LINEARISABLE):
         return Choice(method, reason)
     # A step of ExpRosenbrock costs some steps of another method, and many where it forms matrices.
     times = 10.0 if facts.diagonal else 10.0 + (facts.state / 16) ** 3
@@ -251,12 +256,16 @@ def _read(problem: Problem, t: jax.Array, x0: Tree, args: Any) -> Facts:
     problem.check(t, x0, args)
     like = problem.zero_control(x0)
     state, law = (sum(leaf.size for leaf in jtu.tree_leaves(v)) for v in (x0, like))
-    affine = _is_affine(problem, args, t, x0, like)
+    derivable = all(
+        has_derivative(_plain(lambda x, u, fn=fn: fn(t, x, u, args), x0, like), x0, like)
+        for fn in (problem.f, problem.h)
+    )
+    affine = derivable and _is_affine(problem, args, t, x0, like)
     pointwise = is_pointwise(problem, problem.operator(args), t, x0, args)
     diagonal = pointwise and isinstance(problem.generator(args), Zero | Scalar | Diagonal)
     few = state + law <= 2 * _EXACT or (diagonal and state <= FIELD)
-    linear = few and _is_linear(problem, args, t, x0, like)
-    return Facts(state, law, affine, pointwise, diagonal, linear)
+    linear = derivable and few and _is_linear(problem, args, t, x0, like)
+    return Facts(state, law, affine, pointwise, diagonal, linear, derivable)
 
 
 def _is_linear(problem: Problem, args: Any, t: jax.Array, x0: Tree, like: Tree) -> bool:

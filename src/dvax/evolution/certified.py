@@ -19,6 +19,7 @@ import numpy as np
 from .. import _tree
 from .._captured import Reads
 from .._once import once_per_object
+from .._tree import Tree
 from ..errors import InputError, Problems, input_error
 from ..problem import Problem
 from .defect import ROUNDINGS
@@ -66,6 +67,7 @@ def certified(
     growth = _checked_growth(constants, tol, setup)
     problem, t0, t1 = setup.problem, setup.setting["t0"], setup.setting["t1"]
     _check_domain(problem, constants, setup.args, t0, t1)
+    _check_knots(setup)
     span = t1 - t0
     amplification = growth.amplification(span)
     size, largest = _sizes(setup)
@@ -83,8 +85,9 @@ def certified(
         solution = run(ts, atol)
         if not throw and solution.result != RESULTS.successful:
             return solution  # the result says what failed, and nothing is certified
-        of_defect, largest_x = _assess(solution, growth)
-        of_steps, of_time = _roundoff(solution, growth, largest_x, max(size, largest), eps)
+        of_defect, largest_x, speed = _assess(solution, growth)
+        rate = max(size, largest, speed)
+        of_steps, of_time = _roundoff(solution, growth, largest_x, rate, eps)
         if of_steps + of_time > 0.5 * tol:
             reason = f"roundoff of x in {int(solution.stats['steps'])} steps, and of t"
             least = max(2.0 * (of_steps + of_time), reachable)
@@ -194,21 +197,31 @@ def _sizes_of(numbers: list[Any], t0: Any, signature: Signature) -> jax.Array:
     return jnp.stack([jnp.sqrt(space.size()), jnp.maximum(space.norm(rate), space.norm(x0))])
 
 
-def _assess(solution: Solution, growth: _Growth) -> tuple[float, float]:
-    """Return the largest error bound at the saved times, and the largest norm of x."""
-    data = (solution.setup.x0, solution.xs, solution.ts, _integrated(solution))
-    numbers, signature = flatten((solution.setup.problem,), data, None)
-    bound, norm = np.asarray(_assessed(numbers, growth, solution.setup.setting["t0"], signature))
-    return float(bound), float(norm)
+def _assess(solution: Solution, growth: _Growth) -> tuple[float, float, float]:
+    """Return the largest error bound at the saved times, the largest norm of x, and the largest speed,
+    for responses that are zero."""
+    setup = solution.setup
+    data = (setup.x0, solution.xs, solution.ts, _integrated(solution), setup.args)
+    numbers, signature = flatten((setup.problem,), data, None)
+    found = np.asarray(_assessed(numbers, growth, setup.setting["t0"], signature))
+    return float(found[0]), float(found[1]), float(found[2])
 
 
 @partial(jax.jit, static_argnums=3)
 def _assessed(numbers: list[Any], growth: _Growth, t0: Any, signature: Signature) -> jax.Array:
-    (problem,), (x0, xs, ts, integrated) = signature.unflatten(numbers)
-    space = problem.spaces(x0)[0]
+    (problem,), (x0, xs, ts, integrated, args) = signature.unflatten(numbers)
+    args, space = _tree.as_arrays(args), problem.spaces(x0)[0]
+    A = problem.generator(args)
+
+    def speed(t: Any, x: Tree) -> Any:
+        u = problem.zero_control(x)
+        return space.norm(_tree.add(A.apply(x), problem.f(t, x, u, args)))
+
     norm = jnp.maximum(jnp.max(jax.vmap(space.norm)(xs)), space.norm(x0))
+    start = speed(jnp.asarray(t0, ts.dtype), x0)
+    fastest = jnp.maximum(jnp.max(jax.vmap(speed)(ts, xs)), start)
     bound = jnp.max(_smallest_bounds(t0, ts, integrated, growth)[0])
-    return jnp.stack([bound, norm.astype(bound.dtype)])
+    return jnp.stack([bound, norm.astype(bound.dtype), fastest.astype(bound.dtype)])
 
 
 def _bounds_between(solution: Solution, growth: _Growth) -> jax.Array:
@@ -276,6 +289,20 @@ def _outside(t: float) -> InputError:
     )
 
 
+def _check_knots(setup: Setup) -> None:
+    """Raise if steps do not end at all knots of the data."""
+    t0, t1 = setup.setting["t0"], setup.setting["t1"]
+    knots = setup.problem.data_knots(t0, setup.x0, _tree.as_arrays(setup.args))
+    near = knots.near_ends(t0, t1, float(jnp.finfo(setup.dtype).eps))
+    if near:
+        raise input_error(
+            "dvax.solve(certified_tol)",
+            f"data that may jump at t = {near[0]:.17g}, some roundings of t from an end of the run",
+            "no step ends there, so that the jump is in no bound",
+            "Let the run start or end there, or measure time from a later origin",
+        )
+
+
 def _check_domain(problem: Problem, constants: Any, args: Any, t0: float, t1: float) -> None:
     """Raise if the constants were verified for other times, other `args`, or other values that the
     functions read."""
@@ -291,7 +318,8 @@ def _check_domain(problem: Problem, constants: Any, args: Any, t0: float, t1: fl
     if domain is not None and not domain.has_args(args, Reads(problem)):
         wrong.add(
             "dvax.solve(constants)",
-            "constants of another args, or of other values that f, h or K reads from around it",
+            "constants of another problem, of other args, or of other values that f, h or K reads from "
+            "around it",
             "f and h may be steeper at these parameters than at those",
             "Verify for these: dvax.verify(problem, x0, t0, t1, args)",
         )

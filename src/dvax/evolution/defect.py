@@ -12,7 +12,16 @@ from jax import lax
 
 from .. import _tree
 from .._tree import Tree
-from ..generators import FlowStep, Growth
+from ..generators import (
+    AbstractGenerator,
+    AbstractMatrixFree,
+    Dense,
+    FlowStep,
+    Growth,
+    Product,
+    Rotation,
+    Sparse,
+)
 from ..generators.spectral_state import values
 from ..programs.branches import branches
 from ..programs.enclosure import LinearEnclosure, is_enclosure
@@ -174,15 +183,27 @@ def sampled(
     return Sample(thetas, [*inner, last], error, defect, law_defect, bounds, signed, mean, kinked)
 
 
-def roundoff(space: AbstractSpace, arc: FlowStep) -> jax.Array:
+def roundoff(space: AbstractSpace, A: AbstractGenerator, arc: FlowStep, inset: Any) -> jax.Array:
     """Return a disturbance that is at least the roundoff of a step, so that bounds cover it as well.
 
-    Propagation and summation are taken to have relative errors of `ROUNDINGS` ε; the length of the
-    step has one of ε.
+    Propagation and summation are taken to have relative errors of `ROUNDINGS` ε, and so is the length h
+    of the step, on which x depends as h‖x'‖. At both ends f̃ is evaluated within the step, in all by
+    `inset` away from them: f̃ is then the polynomial Σcₖθᵏ with another θ, which changes it by less than
+    2 Σk‖cₖ‖ inset/h. (After decay Ax is smooth at the end of the step, which it may not be before.)
     """
     h, x0, x1, c = lax.stop_gradient(values(tuple(arc)))
     size = jnp.maximum(space.norm(x0), space.norm(x1))
-    return ROUNDINGS * jnp.finfo(h.dtype).eps * (size + h * space.norm(c[0]))
+    terms = [space.norm(v) for v in c]
+    speed = sum(terms) + (space.norm(A.apply(x1)) if _may_oscillate(A) else 0.0)
+    change = sum(k * term for k, term in enumerate(terms))
+    return ROUNDINGS * jnp.finfo(h.dtype).eps * (size + h * speed) + 2.0 * inset * change
+
+
+def _may_oscillate(A: AbstractGenerator) -> bool:
+    """Return whether x' = Ax may turn fast, unlike diffusion."""
+    if isinstance(A, Product):
+        return any(map(_may_oscillate, A.parts))
+    return isinstance(A, Dense | Rotation | Sparse | AbstractMatrixFree)
 
 
 def _interpolant(nodes: tuple[float, ...], values: tuple[Tree, ...]) -> tuple[Tree, ...]:

@@ -31,7 +31,7 @@ from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
 from ..vi.known import Known
 from .law_tolerance import LawTolerance
-from .linearised import AbstractLinear, linearise
+from .linearised import AbstractLinear, finite, linearise
 from .small_box import AbstractSmallBox
 
 _SMALL = 400
@@ -139,7 +139,7 @@ class Flow(eqx.Module):
         """The flow with J = Df̃(t, x) left to the propagator, and ∂ₜf̃(t, x)."""
         value = lambda t, x: self.rate(t, x, guess).value  # noqa: E731
         _, push = jax.linearize(value, t, x)
-        drift = push(jnp.ones_like(t), _tree.zeros_like(x))
+        drift = finite(push(jnp.ones_like(t), _tree.zeros_like(x)))
         linear = linearise(self.generator, lambda v: push(jnp.zeros_like(t), v), x)
         return dataclasses.replace(self, linear=linear), drift
 

@@ -92,7 +92,7 @@ def linearise(generator: AbstractGenerator, jvp: Any, x: Tree) -> AbstractLinear
         entries = diagonal_of(jvp, x)
         if entries is not None:
             A = jnp.broadcast_to(generator.apply(jnp.ones_like(x)), x.shape)
-            return ElementwiseLinear(A, entries)
+            return ElementwiseLinear(A, finite(entries))
     size = sum(leaf.size for leaf in jtu.tree_leaves(x))
     if size > _MAX_DENSE:
         raise input_error(
@@ -102,4 +102,10 @@ def linearise(generator: AbstractGenerator, jvp: Any, x: Tree) -> AbstractLinear
             "a number or diagonal and f acts point by point",
             "Use dvax.Implicit(), or the default method with more steps",
         )
-    return MatrixLinear(matrix_of(generator.apply, x), matrix_of(jvp, x))
+    return MatrixLinear(matrix_of(generator.apply, x), finite(matrix_of(jvp, x)))
+
+
+def finite(tree: Tree) -> Tree:
+    """Return 0 in the place of entries that are not finite, as those of the derivative of √max(x, 0) at
+    0: f̃ − Jx is exact for any J, and the defect says how long steps may be."""
+    return jtu.tree_map(lambda leaf: jnp.where(jnp.isfinite(leaf), leaf, 0.0), tree)

@@ -32,7 +32,8 @@ def first_bad(tree: Tree, allow_infinite: bool = False) -> str:
     whole, _ = jtu.tree_flatten_with_path(tree, is_leaf=lambda v: isinstance(v, Setup))
     leaves = [v for v in whole if isinstance(v[1], float | np.ndarray | jax.Array)]
     for k, (path, leaf) in enumerate(leaves):
-        if not _tree.is_concrete(leaf) or jnp.result_type(leaf).kind != "f":
+        # The type of a random key is no number.
+        if not _tree.is_concrete(leaf) or not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             continue
         array = np.asarray(leaf)
         bad = np.isnan(array) if allow_infinite else ~np.isfinite(array)

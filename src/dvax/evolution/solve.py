@@ -426,7 +426,9 @@ def _run_chosen(
             for other in [] if reached else choice.after(solution.result):
                 again = setup._replace(method=other.method)
                 second, reached = _differentiably(again, times, options)
-                if reached or solution.result == RESULTS.stiff:
+                # A method that stability limits may need more steps than there may be.
+                is_stiff = solution.result == RESULTS.stiff and second.result == RESULTS.max_steps
+                if reached or is_stiff:
                     text, solution = other.text(f" at t = {t:.6g}"), second
                     break
             solution.stats["method"] = text

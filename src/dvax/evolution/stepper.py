@@ -631,7 +631,10 @@ class Stepper(eqx.Module):
             span = self.ends[1] - self.ends[0]
             sample = enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
         space = self.flow.state_space(values(arc.x1))
-        return sample._replace(defect=sample.defect + roundoff(space, arc))
+        first, last = (self._one_sided_time(t0, t1, theta) for theta in (0.0, 1.0))
+        inset = lax.stop_gradient((first - t0) + (t1 - last))
+        rounding = roundoff(space, lax.stop_gradient(self.flow.generator), arc, inset)
+        return sample._replace(defect=sample.defect + rounding)
 
 
 def _between(theta: float, *ends: tuple[Any, Tree, Tree | None]) -> tuple[Any, Tree, Tree | None]:

@@ -36,6 +36,15 @@ def of_operations(fn: Callable[..., Any], *arguments: Any) -> Callable[..., Any]
     return plain
 
 
+def has_derivative(fn: Callable[..., Any], *arguments: Any) -> bool:
+    """Return whether JAX has a derivative of fn, as it has not of callbacks and of `x.at[i].apply`."""
+    try:
+        jax.eval_shape(lambda *given: jax.jvp(fn, given, given)[1], *arguments)
+    except (NotImplementedError, ValueError, TypeError):
+        return False
+    return True
+
+
 def _evaluated(program: Any, inputs: list[Any]) -> list[Any]:
     """Return the outputs of a program."""
     jaxpr = program.jaxpr

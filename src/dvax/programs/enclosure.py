@@ -259,8 +259,12 @@ def _take(eqn: Any, operands: list[Any]) -> LinearEnclosure:
     certain = jnp.all(jnp.stack([jnp.all(_is_constant(p)) for p in indices]))
     if _below_parabola.get() or not is_real(a):
         return _constant_where(a, b, certain)
-    # For any indices, the value is an entry of the array.
-    width = jnp.max(array) - jnp.min(array)
+    # For any indices, the value is an entry of the array, or what stands for those outside of it. If
+    # that is NaN, as by default, f is undefined there.
+    values, fill = jnp.ravel(array), eqn.params.get("fill_value")
+    if fill is not None and not np.isnan(fill):
+        values = jnp.append(values, jnp.asarray(fill, values.dtype))
+    width = jnp.max(values) - jnp.min(values)
     return LinearEnclosure(a, b, jnp.broadcast_to(jnp.where(certain, 0.0, width), jnp.shape(a)))
 
 

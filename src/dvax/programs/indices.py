@@ -58,8 +58,9 @@ def index_outside(program: Any) -> IndexOutside | None:
 
 def _is_index(value: Any) -> bool:
     """Return whether a value is a concrete array of a few integers or Booleans."""
-    is_small = np.size(value) <= _MAX_SIZE and jnp.result_type(value).kind in "iub"
-    return is_small and _tree.is_concrete(value)
+    dtype = jnp.result_type(value)  # that of a random key is neither
+    is_whole = jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.bool_)
+    return is_whole and np.size(value) <= _MAX_SIZE and _tree.is_concrete(value)
 
 
 def _slice(eqn: Any, operands: list[Any]) -> Iterator[tuple[int, int]]:

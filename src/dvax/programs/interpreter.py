@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._jax.jaxprs import bind, inner_program, read, scan_counts
+from .._jax.jaxprs import applies_function, bind, inner_program, read, scan_counts
 from .._jax.known_functions import operation
 
 Rule = Callable[..., Any]
@@ -56,7 +56,9 @@ def operate(eqn: Any, operands: list[Any], domain: Domain) -> list[Any]:
     """Return the values of the results of one operation."""
     if not any(map(domain.is_abstract, operands)):
         return domain.evaluate(eqn, operands)
-    rule = domain.rules.get(operation(eqn)) or domain.rules.get(eqn.primitive.name)
+    rule = None
+    if not applies_function(eqn):
+        rule = domain.rules.get(operation(eqn)) or domain.rules.get(eqn.primitive.name)
     results = None if rule is None else domain.apply(rule, eqn, operands)
     if results is not None:
         return results

@@ -115,10 +115,21 @@ class BoundAlong:
         none."""
         a, at_kink = self.t, self.unknown >= _MAX_AT_KINK
         piece = self.tube.piece(a, b, saved, self.before, self.initial_error)
-        if isinstance(piece, Piece):
-            self.steps += int(piece.sol.stats["steps"])
-        if b - a > _SHORTEST * self.span and (
-            isinstance(piece, str) or piece.excess(b - a, self.span, at_kink) > 1.0
+        self.steps += self.tube.latest_steps
+        if self.max_steps is not None and self.steps > self.max_steps:
+            self.why = (
+                f"the trajectory along which it is proved took {self.steps} steps to t = {b:.6g}"
+            )
+        elif self.max_steps is not None:
+            # Steps of order 2 are as long as the root of the tolerance.
+            expected = self.tube.latest_steps * (self.end - a) / (b - a)
+            self.tube.loosen((expected / (self.max_steps - self.steps + 1)) ** 2)
+        if self.why and isinstance(piece, str):
+            return None
+        if (
+            not self.why
+            and b - a > _SHORTEST * self.span
+            and (isinstance(piece, str) or piece.excess(b - a, self.span, at_kink) > 1.0)
         ):
             self.length = 0.5 * (b - a)
             return None
@@ -129,14 +140,6 @@ class BoundAlong:
         if piece.x[-1] > _USELESS * (1.0 + size):
             self.why = f"at t = {b:.6g} it has grown to {_USELESS:.0g} times the solution"
             return None
-        if self.max_steps is not None and self.steps > self.max_steps:
-            self.why = (
-                f"the trajectory along which it is proved had {self.steps} steps at t = {b:.6g}"
-            )
-        elif self.max_steps is not None:
-            # Steps of order 2 are as long as the root of the tolerance.
-            expected = int(piece.sol.stats["steps"]) * (self.end - b) / (b - a)
-            self.tube.loosen((expected / (self.max_steps - self.steps + 1)) ** 2)
         self.unknown = 0 if piece.knows_law else self.unknown + 1
         if piece.excess(self.length, self.span, at_kink) < 0.25:
             self.length = min(2.0 * self.length, self.span / 8)

@@ -49,7 +49,7 @@ class Bound(eqx.Module):
     - `x_paper`, `u_paper`: with the paper's rate ω + ML̃;
     - `x_sharp`, `u_sharp`: with the one-sided constant μ or the rate of an energy norm, whichever is
       smaller; None if neither is known;
-    - `why`: the reason for which the bound is infinite from some time on, or empty;
+    - `why`: the reason for which the bound is infinite from some time on, or estimated, or empty;
     - `integrals`, (m, k): the Gronwall estimates of the k rates over their factors M, with which a run
       that goes on starts; None if the problem was solved again;
     - `status`: the weakest status among the quantities in the bound. "proved" means that the constants

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
+from ..programs.derivatives_of_operations import has_derivative
 from ..programs.slope import is_slope
 from ..spaces import AbstractSpace
 from .region import Region
@@ -70,8 +71,9 @@ class SlopeSearch(NamedTuple):
 def search_slope(system: System, region: Region, name: str, by: str) -> SlopeSearch:
     """Return a lower bound on the Lipschitz modulus of `name` ("f" or "h") in `by` ("x" or "u").
 
-    A search in a bounded region takes the largest norm of the derivative and the largest difference
-    quotient between near and far points, and halves the segments between far points towards a jump.
+    A search in a bounded region takes the largest norm of the derivative, where there is one, and the
+    largest difference quotient between near and far points, and halves the segments between far points
+    towards a jump.
     """
     fn = getattr(system.problem, name)
     out = system.state if name == "f" else system.control
@@ -87,7 +89,9 @@ def search_slope(system: System, region: Region, name: str, by: str) -> SlopeSea
 
     low, high = _bounds(region)
     starts = _points(low, high, _STARTS, 1)
-    best = jax.vmap(norm)(_climb(norm, starts, low, high))
+    t, *at = jtu.tree_map(lambda leaf: leaf[0], starts)
+    known = has_derivative(partial(with_argument, t, *at), at[0 if by == "x" else 1])
+    best = [jax.vmap(norm)(_climb(norm, starts, low, high))] if known else []
     others = _points(low, high, _STARTS, 2)
     quotients = []
     k = 1 if by == "x" else 2
@@ -96,7 +100,7 @@ def search_slope(system: System, region: Region, name: str, by: str) -> SlopeSea
         quotients.append(
             jax.vmap(lambda p, v: _quotient(with_argument, p, v, out, into, by))(starts, ends)
         )
-    slopes = jnp.concatenate([best, *quotients])
+    slopes = jnp.concatenate([*best, *quotients])
     value = float(jnp.max(jnp.where(jnp.isfinite(slopes), slopes, 0.0)))
     return SlopeSearch(value, _jump(with_argument, starts, starts[k], others[k], out))
 

@@ -18,8 +18,8 @@ from ..spaces import AbstractSpace
 class Domain(eqx.Module):
     """The set of times, parameters, states and responses for which constants hold.
 
-    They hold for t0 ≤ t ≤ t1 (−∞ and ∞ if f, h and K do not depend on t), one value of `args`, and what
-    the functions read from around them (`reads`; None: not known to matter).
+    They hold for t0 ≤ t ≤ t1 (−∞ and ∞ if f, h and K do not depend on t), one value of `args`, and one
+    problem with what its functions read from around them (`reads`; None: not known to matter).
     `x` and `u` are entrywise bounds (low, high); None means any x, and any u in P⁻¹K(t).
     """
 
@@ -75,7 +75,11 @@ class Domain(eqx.Module):
         values, frame = _numbers_and_rest(args)
         if frame != self.frame or not _tree.is_concrete(values, self.values):
             return False
-        return all(np.array_equal(a, b) for a, b in zip(values, self.values, strict=True))
+        # A quotient of integers is rounded.
+        return all(
+            jnp.result_type(a) == jnp.result_type(b) and np.array_equal(a, b)
+            for a, b in zip(values, self.values, strict=True)
+        )
 
     def contains(
         self,
@@ -133,6 +137,7 @@ class Domain(eqx.Module):
 def _numbers_and_rest(args: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Return the numbers in args, and its structure with the other leaves."""
     leaves, structure = jtu.tree_flatten(args)
+    leaves = [jax.random.key_data(leaf) if _tree.is_key(leaf) else leaf for leaf in leaves]
     numbers = tuple(leaf for leaf in leaves if eqx.is_array_like(leaf))
     others = tuple(None if eqx.is_array_like(leaf) else leaf for leaf in leaves)
     return numbers, (structure, others)

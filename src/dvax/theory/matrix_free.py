@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._tree import Tree
+from ..programs.derivatives_of_operations import has_derivative
 from ..spaces import AbstractSpace
 from ..vi import analyse, independent
 from .lanczos import largest_eigenvalue_bound
@@ -104,6 +105,8 @@ class AffineMap:
         def slope(t: Any) -> Tree:
             return jax.jvp(lambda v: self._at(t, v), (both,), (both,))[1]
 
+        if not has_derivative(lambda v: self._at(self.t0, v), both):
+            return False
         if not independent(slope, self.t0):
             return False
         return analyse(lambda v: self._at(self.t0, v), both).affine

@@ -139,6 +139,7 @@ class Tube:
         # Factors of the tolerances of x_c, and of the smallest reach of a tube; and whether constants
         # need bounds of u.
         self.looseness, self.width, self.limits_u = 1.0, 1.0, False
+        self.latest_steps = 0  # of x_c on the latest piece, whatever became of it
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
         )
@@ -248,11 +249,13 @@ class Tube:
         if before is not None:
             x = jtu.tree_map(lambda rows: rows[-1], before.sol.xs)
             step = min(float(before.sol.stats["next_dt"]), nodes[-1] - a)
-        return solve(
+        found = solve(
             self.problem, x, a, nodes[-1], self.args, times,
             rtol=self.looseness * self.rtol, atol=self.looseness * self.atol,
             method=ETD2RK(), constants=self.first, dt0=step, horizon=self.span, throw=False,
         )  # fmt: skip
+        self.latest_steps = int(found.stats["steps"])
+        return found
 
     def _smaller(
         self, bound: Bound, constants: Constants, sol: Solution, along: _Propagation | None,

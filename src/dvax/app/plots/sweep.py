@@ -187,7 +187,8 @@ def _members(path: Path, keys: list[str]) -> _Members | None:
         about = array.attrs.asdict()
         words = str(about.get("long_name", name))
         values = np.asarray(array[...])
-        values = values.astype(str) if values.dtype.kind == "T" else values
+        # Some releases of NumPy have no cast from its type of texts of any length.
+        values = np.array(values.tolist(), str) if values.dtype.kind == "T" else values
         return _Axis(name, values, str(about.get("units", "")), words)
 
     apart, figures = {*keys, "member", "status"}, []

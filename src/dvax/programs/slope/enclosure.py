@@ -144,7 +144,8 @@ def _evaluate(eqn: Any, operands: list[Any]) -> list[Any]:
     """Return the results of an operation on constants. NumPy rounds arithmetic as XLA does, and
     compiles no program."""
     name, aval = operation(eqn), eqn.outvars[0].aval
-    if aval.dtype.kind == "f" and _tree.is_concrete(operands):
+    is_known = _tree.is_concrete(operands) and not any(map(_tree.is_key, operands))
+    if is_known and jnp.issubdtype(aval.dtype, jnp.floating):
         arrays = [np.asarray(v) for v in operands]
         if name in _ARITHMETIC and all(a.dtype == aval.dtype for a in arrays):
             return [np.asarray(_ARITHMETIC[name](*arrays))]
