@@ -121,8 +121,10 @@ class BoundAlong:
                 f"the trajectory along which it is proved took {self.steps} steps to t = {b:.6g}"
             )
         elif self.max_steps is not None:
-            # Steps of order 2 are as long as the root of the tolerance.
-            expected = self.tube.latest_steps * (self.end - a) / (b - a)
+            # Steps of order 2 are as long as the root of the tolerance. A piece that is too long is not
+            # like those that follow.
+            left = (self.end - b) / (b - a) if isinstance(piece, Piece) else 1.0
+            expected = self.tube.latest_steps * left
             self.tube.loosen((expected / (self.max_steps - self.steps + 1)) ** 2)
         if self.why and isinstance(piece, str):
             return None

@@ -229,7 +229,7 @@ class Tube:
             if along is not None:
                 sol = along.sol
             bound = self._bounded(sol, constants, before, error)
-            why = bound.why
+            why = bound.why or "x may leave every tube around the trajectory that was tried"
             piece = self._smaller(bound, constants, sol, along, reach)
             if piece is not None and np.isfinite(piece.x).all():
                 self.width = max(1.0, self.width / 4.0)

@@ -70,7 +70,7 @@ class PythonSection(FramesKeys):
         False, description="search for a norm in which the error bound grows more slowly"
     )
     bound_steps: int = Field(
-        500_000,
+        1_000_000,
         ge=0,
         description="largest number of steps of the trajectory along which the error bound is proved; "
         "0: by constants for the whole space",
