@@ -370,7 +370,7 @@ SHAPE = {"load": LOADS[:3]}
 
 @pytest.mark.parametrize(("arguments", "options", "words"), [
     ((STARTS[:4], 0.0, 1.0, SHAPE), {}, r"x0s has 4, args\['load'\] has 3"),
-    ((1.0, 0.0, 1.0, {"load": 2.0}), {}, "nothing with a member axis"),
+    ((1.0, 0.0, 1.0, {"load": 2.0}), {}, "no array with a member axis"),
     ((STARTS[:3], 0.0, np.array([1.0, 1.0, 0.0]), SHAPE), {}, "member 2: got 0, 0"),
     ((STARTS[:3], 0.0, 1.0, SHAPE, [0.5, 2.0]), {}, r"vector of increasing times in \[0.0, 1.0\]"),
     ((STARTS[:3], 0.0, 1.0, SHAPE, [[0.5], [1.0], [2.0]]), {}, r"ts\) of member 2"),
@@ -474,3 +474,27 @@ def test_parameters_of_the_members_are_coordinates():
     for wrong in ({"load": loads[:-1]}, {"load": 1.0}, {"value": loads}):
         with pytest.raises(dvax.InputError, match="a row for each of the 5 members"):
             found.to_xarray(parameters=wrong)
+
+
+@pytest.mark.slow
+def test_the_mean_of_times_of_events_that_did_not_happen_is_infinite():
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 3.0),
+        f=lambda t, x, u, rate: rate - x + u, h=lambda t, x, u, rate: 1.0 - x,
+    )  # fmt: skip
+    found = dvax.ensemble(
+        problem, 0.0, 0.0, 5.0, jnp.linspace(0.5, 2.0, 4), observe=lambda sol: sol.events.ts,
+        events=[dvax.Event(lambda t, x, u, rate: x - 0.5)], max_events=2,
+    )  # fmt: skip
+    assert float(found.mean[0]) == pytest.approx(float(jnp.mean(found.values[:, 0])))
+    assert float(found.mean[1]) == np.inf
+
+
+def test_moments_of_infinite_rows_are_joined_without_a_warning():
+    rows = np.array([[1.0, np.inf], [2.0, np.inf], [6.0, np.inf]])
+    parts = [
+        Moments.of(rows[part], np.ones(n, bool)) for part, n in ((slice(2), 2), (slice(2, 3), 1))
+    ]
+    whole = parts[0].merge(parts[1])
+    np.testing.assert_allclose(whole.mean, [3.0, np.inf])
+    assert float(whole.standard_deviation()[0]) == pytest.approx(np.std([1.0, 2.0, 6.0], ddof=1))

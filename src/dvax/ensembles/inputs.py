@@ -56,10 +56,11 @@ class Inputs(NamedTuple):
         if not counts or len(set(counts.values())) > 1 or min(counts.values()) == 0:
             listed = ", ".join(f"{name} has {count}" for name, count in counts.items())
             wrong.add(
-                "dvax.ensemble(x0s, args)", listed or "nothing with a member axis",
-                "axis 0 of each array counts the members, of which there is at least one",
-                "Give all of them the same length, and say in axes= what the members share: "
-                "axes=(None, 0) for one x0",
+                "dvax.ensemble(x0s, args)", listed or "no array with a member axis",
+                "axis 0 of each array counts the members, of which there is at least one; a list or a "
+                "tuple is no array, but a tree of numbers",
+                "Give all of them the same length, write jnp.array([...]) for a list, and say in axes= "
+                "what the members share: axes=(None, 0) for one x0",
             )  # fmt: skip
         wrong.raise_any()
         return Inputs(leaves, tree, tuple(own), min(counts.values()))

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .. import _tree
 from .._tree import Tree
@@ -43,7 +44,8 @@ class Moments(NamedTuple):
             return xp.where(count > 0, mean, xp.nan)
 
         def squares(leaf: Any, mean: Any) -> Any:
-            away = xp.where(_wide(valid, leaf), leaf, mean) - mean
+            with np.errstate(invalid="ignore"):  # of infinities
+                away = xp.where(_wide(valid, leaf), leaf, mean) - mean
             return xp.sum(xp.abs(away) ** 2, axis=0)
 
         means = jtu.tree_map(mean, rows)
@@ -57,8 +59,16 @@ class Moments(NamedTuple):
         if not self.count:
             return other
         share = other.count / count
-        away = jtu.tree_map(lambda a, b: b - a, self.mean, other.mean)
-        mean = jtu.tree_map(lambda a, d: a + share * d, self.mean, away)
+
+        def joined(a: Any, b: Any) -> Any:
+            # ∞ − ∞ is not a number, and the mean of infinities is infinite, as the times of events that
+            # did not happen.
+            xp = _tree.array_module(a, b)
+            return xp.where(a == b, a, a + share * (b - a))
+
+        with np.errstate(invalid="ignore"):
+            away = jtu.tree_map(lambda a, b: b - a, self.mean, other.mean)
+            mean = jtu.tree_map(joined, self.mean, other.mean)
         squares = jtu.tree_map(
             lambda a, b, d: a + b + self.count * share * abs(d) ** 2,
             self.squares,

@@ -1,5 +1,6 @@
 """The report of a sweep: which axes are logarithmic, and which arrays of its store are figures."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -67,3 +68,17 @@ def test_names_are_in_the_order_of_their_numbers():
     names = ["final_q10", "final_q2", "final_q1", "x²", "final_p[2]", "3d"]
     expected = ["3d", "final_p[2]", "final_q1", "final_q2", "final_q10", "x²"]
     assert sorted(names, key=_with_numbers) == expected
+
+
+def test_texts_are_read_as_values_of_an_axis(tmp_path):
+    """Methods, or quantities with units, are texts of any length, which zarr reads as such."""
+    group = zarr.open_group(tmp_path / "sweep.zarr", mode="w", zarr_format=3)
+    texts = np.array(["ETD2RK", "20 N/m", "4"], dtype=np.dtypes.StringDType())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the type is no part of the specification of zarr yet
+        group.create_array("model.method", data=texts, dimension_names=["member"])
+    group.create_array("status", data=np.array([1, 1, 2]), dimension_names=["member"])
+    group.create_array("peak", data=np.array([0.1, 0.2, 0.3]), dimension_names=["member"])
+    found = _members(tmp_path / "sweep.zarr", ["model.method"])
+    assert found is not None
+    assert [axis.values.tolist() for axis in found.parameters] == [["ETD2RK", "20 N/m", "4"]]

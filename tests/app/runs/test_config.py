@@ -9,6 +9,7 @@ import tomli_w
 
 from dvax.app.runs.config import build_contact, load_config
 from dvax.app.runs.resolved import write_resolved
+from dvax.app.runs.units import converted
 from dvax.errors import InputError
 
 from .example import LOAD, REMOVE, STRIP, write
@@ -33,6 +34,18 @@ def test_config_default_companion_crosses_the_active_regime(tmp_path):
     inputs = build_contact(load_config(write(tmp_path)))
     # b_x dx = (1 + b_u) kappa0 / beta is the width of the active regime in the drive q.
     np.testing.assert_allclose(0.8 * (inputs.companion_x0 - inputs.x0), 1.6 * 2.0 / 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "number"),
+    [
+        ("12 L/s", "m^3/s", 0.012), ("7 mN", "N", 0.007), ("0.3 kN", "N", 300.0),
+        ("36 km/h", "m/s", 10.0),
+        ("1.1 mm", "m", 0.0011), ("2.2 ms", "s", 0.0022), ("1e-3 MPa", "Pa", 1000.0),
+    ],
+)  # fmt: skip
+def test_a_decimal_quantity_is_converted_to_the_nearest_number(text, unit, number):
+    assert converted(text, unit) == number
 
 
 def test_config_quantities_with_units_are_converted(tmp_path):

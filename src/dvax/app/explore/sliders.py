@@ -14,7 +14,7 @@ from dvax.app.explore.subject import Parameter
 from dvax.app.runs.applications.config import OWN, ModelConfig
 from dvax.app.runs.applications.from_model import FramesKeys
 
-_NOT_MOVED = set(FramesKeys.model_fields) | {"seed"}
+_NOT_MOVED = set(FramesKeys.model_fields) | {"seed", "bound_steps"}
 """Options of the solver do not change the exact solution."""
 
 

@@ -133,7 +133,8 @@ def converted(text: str, unit: str) -> float | None:
     if match is None:
         return None
     try:
-        return float(match["number"]) * ratio(match["unit"], unit)
+        # Rounded to the digits that a decimal number keeps: 12 L/s is 0.012 m3/s, and no more.
+        return float(f"{float(match['number']) * ratio(match['unit'], unit):.15g}")
     except UnitError:
         return None
 
