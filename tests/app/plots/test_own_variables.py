@@ -31,3 +31,10 @@ def test_numbered_names_have_a_panel_each_and_other_names_one_for_their_unit():
 def test_entries_of_a_vector_are_not_called_places():
     titles = [picture.title for picture in drawn(x=np.ones((5, 9)) * TIMES[:, None])]
     assert titles == ["x over entries and time", "x at one time"]
+
+
+def test_a_single_number_or_a_space_before_it_parts_no_names_of_one_unit():
+    (picture,) = drawn(**{name: TIMES for name in ("level 1", "level_2")})
+    assert titles_of_axes(picture) == {"level [m]"}
+    (picture,) = drawn(**{name: TIMES for name in ("inner", "outer_2", "gap")})
+    assert titles_of_axes(picture) == {"value [m]"}

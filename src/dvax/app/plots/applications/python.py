@@ -1,6 +1,7 @@
 """Pictures of a model that has none of its own: its variables over time, a panel for each unit and
 each numbered name."""
 
+from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -20,6 +21,7 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
     largest entries."""
     time = data["time"]
     t, unit = time.values, time.unit
+    numbered = Counter((v.unit, _numbered(name)) for name, v in data.items() if v.values.ndim == 1)
     groups: dict[tuple[str, str], list[tuple[str, np.ndarray]]] = {}
     arrays: list[Panel] = []
     fields: list[tuple[str, np.ndarray, Axis]] = []
@@ -28,7 +30,10 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
         if name in ("time", "error_bound") or len(values) != len(t):
             continue
         if values.ndim == 1:
-            groups.setdefault((variable.unit, _numbered(name)), []).append((name, values))
+            key = variable.unit, _numbered(name)
+            # One name with a number is a name as others.
+            key = key if numbered[key] > 1 else (variable.unit, "")
+            groups.setdefault(key, []).append((name, values))
         elif values.ndim == 2 and len(t) > 1 and values.shape[1] > _CURVES:
             fields.append((name, values, Axis(name, variable.unit)))
         else:
@@ -66,7 +71,7 @@ def _extremes(t: np.ndarray, name: str, values: np.ndarray, unit: str) -> Panel:
 def _numbered(name: str) -> str:
     """Return the name before the number of an entry: x of x0, x1, …; empty without a number."""
     word = name.rstrip("0123456789")
-    return "" if word == name else word.rstrip("_")
+    return "" if word == name else word.rstrip("_ ")
 
 
 def _panels(
