@@ -34,7 +34,7 @@ def test_entries_of_a_vector_are_not_called_places():
 
 
 def test_a_single_number_or_a_space_before_it_parts_no_names_of_one_unit():
-    (picture,) = drawn(**{name: TIMES for name in ("level 1", "level_2")})
+    (picture,) = drawn(**dict.fromkeys(("level 1", "level_2"), TIMES))
     assert titles_of_axes(picture) == {"level [m]"}
-    (picture,) = drawn(**{name: TIMES for name in ("inner", "outer_2", "gap")})
+    (picture,) = drawn(**dict.fromkeys(("inner", "outer_2", "gap"), TIMES))
     assert titles_of_axes(picture) == {"value [m]"}

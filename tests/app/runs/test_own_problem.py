@@ -259,3 +259,14 @@ def test_end_of_a_run_may_have_a_unit_of_time(tmp_path):
     file = written(tmp_path, POINT, TABLE + 't_end = "90 s"\n')
     config = read_config(file, allow_code=True)
     assert config.model.t_end == 1.5 and config.tree()["model"]["t_end"] == "90 s"
+
+
+@pytest.mark.parametrize(
+    ("body", "value"), [("x0 = 1.0 / load", "0"), ("limit = -limit", "3.0"), ("load.shape", "2.5")]
+)
+def test_an_error_in_the_file_names_the_parameters_that_are_given(tmp_path, body, value):
+    code = POINT.replace("points: int = 1):", f"points: int = 1):\n    {body}", 1)
+    name = "limit" if "limit" in body else "load"
+    table = f"{TABLE}\n[model.parameters]\n{name} = {value}\n"
+    (problem, *_) = problems(tmp_path, code, table)
+    assert f"[model.parameters] has {name} = {value}" in problem

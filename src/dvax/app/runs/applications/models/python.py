@@ -110,10 +110,10 @@ class PythonApplication(AbstractModelApplication):
         try:
             arguments = parameters.arguments(made, located)
             model = _built(self.file, table.function, lambda: build(**arguments))
-        except InputError:
+        except InputError as error:
             # With wrong parameters only the problems are of interest that do not depend on them.
             problems.raise_any()
-            raise
+            raise _with_parameters(error, table.parameters) from error
         self.certified, self.place_of_figures = table.certify, f"{self.file.name}: figures"
         may_use_energy = not table.energy and _unknowns(model) <= MAX_UNKNOWNS
         self.energy, self.remedy = table.energy, _remedy(may_use_energy)
@@ -216,6 +216,16 @@ def _built(file: Path, function: str, build: Callable[[], Any]) -> Model:
         )  # fmt: skip
     _run(file, lambda: model.problem.check(model.t0, model.x0, model.args))
     return model
+
+
+def _with_parameters(error: InputError, given: Mapping[str, Any]) -> InputError:
+    """Return an error of the user's code with the parameters that are given, one of which may be its
+    cause."""
+    listed = ", ".join(f"{name} = {value!r}" for name, value in given.items())
+    if not listed:
+        return error
+    told = f"[model.parameters] has {listed}"[:300]
+    return InputError(*(replace(p, fix=f"{p.fix}. {told}") for p in error.problems))
 
 
 def _unknowns(model: Model) -> int:
