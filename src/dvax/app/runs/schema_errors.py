@@ -2,8 +2,10 @@
 
 import json
 import re
+from dataclasses import replace
 from difflib import get_close_matches
-from typing import Any, Literal, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -49,8 +51,46 @@ def unknown_key(place: str, key: str, value: Any, known: list[str]) -> InputProb
 def translate(
     error: ValidationError, file: str, section: str, model: type[BaseModel]
 ) -> list[InputProblem]:
-    """One problem for each finding: file and dotted key, what was given, the rule, the fix."""
-    return [_problem(dict(e), file, section, model) for e in error.errors(include_url=False)]
+    """One problem for each key: file and dotted key, what was given, the rule, the fix."""
+    groups: dict[tuple[str | int, ...], list[dict[str, Any]]] = {}
+    for found in map(dict, error.errors(include_url=False)):
+        path = list(found["loc"])
+        at = _alternative(model, path)
+        # Of a key with several types pydantic has an error for each of them, named in the path.
+        groups.setdefault(tuple(path[:at]), []).append(found)
+        found["loc"] = tuple(path if at is None else path[:at] + path[at + 1 :])
+    return [_joined(group, file, section, model) for group in groups.values()]
+
+
+def _alternative(model: type[BaseModel], path: list[str | int]) -> int | None:
+    """Return the number of the part of a path that names one of several types; None without one."""
+    for k, part in enumerate(path[:-1]):
+        info = model.model_fields.get(part) if isinstance(part, str) else None
+        if info is None:
+            return None
+        inner = _model_within(info.annotation)
+        if inner is not None:
+            model = inner
+            continue
+        kinds = [a for a in get_args(info.annotation) if a is not NoneType]
+        is_union = get_origin(info.annotation) in (Union, UnionType)
+        return k + 1 if is_union and len(kinds) > 1 else None
+    return None
+
+
+def _joined(
+    group: list[dict[str, Any]], file: str, section: str, model: type[BaseModel]
+) -> InputProblem:
+    """Return the problem of one key: that of the type which fits best, or of all if none does."""
+    deepest = max(len(error["loc"]) for error in group)
+    best = [error for error in group if len(error["loc"]) == deepest]
+    problem = _problem(best[0], file, section, model)
+    others = [_TYPES[error["type"]] for error in best[1:] if error["type"] in _TYPES]
+    first = _TYPES.get(best[0]["type"])
+    if not others or first is None:
+        return problem
+    rule = problem.rule.replace(first, " or ".join([first, *others]), 1)
+    return replace(problem, rule=rule)
 
 
 def _problem(
