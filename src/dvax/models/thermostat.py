@@ -111,9 +111,13 @@ class Thermostat(eqx.Module):
         for name, value in (("lower", lower), ("upper", upper)):
             setattr(self, name, _field(name, value, cells, wrong))
         if not wrong and _tree.is_concrete(self.lower, self.upper):
-            if np.any(np.asarray(self.lower) > np.asarray(self.upper)):
+            low, high = np.asarray(self.lower), np.asarray(self.upper)
+            if np.any(low > high):
+                at = np.unravel_index(np.argmax(low - high), low.shape)
                 wrong.add(
-                    "dvax.models.Thermostat(lower, upper)", "lower > upper somewhere",
+                    "dvax.models.Thermostat(lower, upper)",
+                    f"lower = {low[at]:.6g} and upper = {high[at]:.6g} in cell "
+                    f"{tuple(int(k) for k in at)}",
                     "lower ≤ upper must hold in every cell", "Swap the bounds there",
                 )  # fmt: skip
         wrong.raise_any()

@@ -146,6 +146,17 @@ REFUSED = {
         ("model.outdoor", "the name of a CSV file"),
     ),
     "a wrong unit": (ROOM.replace('"weather.csv"', '"3 m"'), {}, ("model.outdoor", "degC")),
+    "colder than can be": (ROOM + "initial = -300.0\n", {}, ("model.initial", "at least -273.15")),
+    "another unit of temperature": (
+        ROOM + 'initial = "288 K"\n',
+        {},
+        ("model.initial", "does not start at zero", '2.5 degC"'),
+    ),
+    "ends exchanged": (
+        ROOM + "[[model.heaters]]\nx = [1.5, 0.0]\ny = [0.0, 6.0]\n",
+        {},
+        ("model.heaters[1].x", "the first end is the smaller one"),
+    ),
     "less than nothing": (ROOM + "power_max = -1.0\n", {}, ("model.power_min, model.power_max",)),
     "a heater outside": (
         ROOM + "[[model.heaters]]\nx = [9.0, 10.0]\ny = [0.0, 6.0]\n",

@@ -113,8 +113,9 @@ def _converted(text: str, unit: str) -> float:
     number = converted(text, unit)
     if number is None and is_quantity(text) and not is_linear(unit):
         raise rule_error(
-            f"its unit is {unit!r}, which is no unit that a text can be converted to",
-            "Write a bare number, or correct the unit where the parameter is declared",
+            f"its unit is {unit!r}, to which no text in another unit is converted: it is unknown, or "
+            "does not start at zero",
+            f'Write a bare number, or "2.5 {unit}"',
         )
     if number is None:
         raise rule_error(

@@ -41,7 +41,9 @@ class ThermostatSection(FramesKeys):
     gains: Annotated[float | str, number_or_file("W/m^2")] = Field(
         0.0, description="heat of sun and people, a number or a CSV file [W/m^2]"
     )
-    initial: float = Field(15.0, description="temperature at the start [degC]")
+    initial: Annotated[float, in_unit("degC")] = Field(
+        15.0, ge=-273.15, description="temperature at the start [degC]"
+    )
     lengths: Annotated[list[float], _SIDES] = Field([8.0, 6.0], description="sides [m]")
     cells: Annotated[list[int], _SIDES] = Field(
         [32, 24], description="cells along the sides; [1, 1] for one room temperature"
@@ -131,6 +133,14 @@ class ThermostatApplication(AbstractModelApplication):
             return np.ones(t.cells, bool)
         problems, heated = Problems(), np.zeros(t.cells, bool)
         for k, a in enumerate(t.heaters):
+            swapped = [name for name, ends in (("x", a.x), ("y", a.y)) if ends[0] > ends[1]]
+            for name in swapped:
+                problems.add(
+                    f"model.heaters[{k + 1}].{name}", str(getattr(a, name)),
+                    "the first end is the smaller one", "Exchange the two numbers",
+                )  # fmt: skip
+            if swapped:
+                continue
             inside = (a.x[0] <= x) & (x <= a.x[1]) & (a.y[0] <= y) & (y <= a.y[1])
             if not inside.any():
                 problems.add(
