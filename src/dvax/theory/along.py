@@ -92,6 +92,7 @@ class BoundAlong:
         while ts[-1] not in self.rows and not self.why:
             self._advance()
         found = [self.rows[t] for t in ts if t in self.rows]
+        assert self.why or len(found) == len(ts), "a saved time that was not announced"
         # The next part may have the last time of this one again.
         self.rows = {t: row for t, row in self.rows.items() if t >= ts[-1]}
         return _assembled(self.problem, sol, found, self.why if len(found) < len(ts) else "")

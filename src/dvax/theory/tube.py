@@ -336,7 +336,7 @@ class Tube:
         begins = np.array([along.start, *ends[:-1]])
         nodes = [ends]
         for k in large:
-            cuts = max(1, int(room * shares[k] / part))
+            cuts = 1 + int((room - len(large)) * shares[k] / part)  # `room` in all
             nodes.append(np.linspace(begins[k], ends[k], cuts + 2)[1:-1])
         return np.unique(np.concatenate(nodes))
 
