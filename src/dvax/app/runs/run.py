@@ -144,7 +144,8 @@ class AbstractRun(abc.ABC):
         if status != "finished":
             with writing():
                 self.try_checkpoint()
-        reason = f"{reason} {self.gather()}".rstrip()
+        missing = self.gather()
+        reason = f"{reason.removesuffix('.')}. {missing}" if missing else reason
         with writing():
             figures, has_results = self.write()
             figures = {"status": Figure(status, "1", reason), **figures}

@@ -60,6 +60,7 @@ class ApplicationRun(AbstractRun):
         self.is_shown = False
         self.last: Work[Results] | None = None
         self.results: Results | None = None
+        self.has_told = False  # the reason for which there are no figures
 
     def begin(self) -> None:
         self.path = self.directory.path / "trajectory.zarr"
@@ -93,8 +94,7 @@ class ApplicationRun(AbstractRun):
             if is_first:
                 self._show()
                 # Compile all programs of the figures now, so that they need no time after an interrupt.
-                self.last = Work(self._compute())
-                self.last.result()
+                self._figures()
                 self.last = None
                 self.event("compiled", compile_seconds=self.compiling())
             begin, t = float(plan.times[0]), float(piece.ts[-1])
@@ -106,8 +106,16 @@ class ApplicationRun(AbstractRun):
                 self.try_checkpoint()
         self._stage("writing the results")
         self._flush()
+        self.results = self._figures()
+
+    def _figures(self) -> Results:
+        """Return the results of the rows in the store. An error of the user's figures ends the run."""
         self.last = Work(self._compute())
-        self.results = self.last.result()
+        try:
+            return self.last.result()
+        except Exception:
+            self.has_told = True
+            raise
 
     def _take(self, piece: Solution | None, count: int) -> None:
         """Compute the rows of the next piece."""
@@ -176,6 +184,8 @@ class ApplicationRun(AbstractRun):
     def gather(self) -> str:
         if self.results is not None or not self.is_shown:
             return ""
+        if self.has_told:
+            return "Its figures are missing."
         with writing():
             self._flush()
         try:
