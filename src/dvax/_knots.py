@@ -38,13 +38,16 @@ def merge(listed: list[Any], t0: Any, t1: Any) -> Any:
     return jnp.sort(jnp.where(_is_distinct(merged), merged, t1))
 
 
-def near_ends(listed: list[Any], t0: float, t1: float, eps: float) -> list[float]:
-    """Return the known knots inside (t0, t1) that are no rounded ends, and as close to one as if they
-    were: steps do not end there, and a jump at such a time is missed."""
-    known = [np.ravel(np.asarray(knots, float)) for knots in listed if _tree.is_concrete(knots)]
-    knots = np.unique(np.concatenate([np.zeros(0), *known]))
-    gaps = np.minimum(knots - t0, t1 - knots) / (eps * max(abs(t0), abs(t1), 1e-300))
-    return knots[(gaps > KNOT_ULPS) & (gaps <= END_ULPS)].tolist()
+def near_end(listed: list[Any], t0: Any, t1: Any) -> Any:
+    """Return the first knot inside (t0, t1) that is no rounded end, and as close to one as if it were;
+    infinity without one. Steps do not end there, and a jump at such a time is missed."""
+    knots = jnp.concatenate(
+        [jnp.zeros(0, t0.dtype), *(jnp.ravel(v).astype(t0.dtype) for v in listed)]
+    )
+    ulp = jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    gaps = jnp.minimum(knots - t0, t1 - knots)
+    is_near = (gaps > KNOT_ULPS * ulp) & (gaps <= END_ULPS * ulp)
+    return jnp.min(jnp.where(is_near, knots, jnp.inf), initial=jnp.inf)
 
 
 def _is_distinct(knots: Any) -> Any:

@@ -65,11 +65,10 @@ class Knots(NamedTuple):
         _check_spans(self.spans, t0, t1)
         return _knots.merge(self.listed, t0, t1) if self.listed else np.zeros(0)
 
-    def near_ends(self, t0: Any, t1: Any, eps: float) -> list[float]:
-        """Return the known knots so close to an end, in roundings `eps` of t, that `within` may leave
-        them out; none for traced ends."""
-        is_known = _tree.is_concrete(t0, t1)
-        return _knots.near_ends(self.listed, float(t0), float(t1), eps) if is_known else []
+    def near_end(self, t0: Any, t1: Any) -> Any:
+        """Return the first knot that `within` leaves out since it is close to an end; infinity without
+        one."""
+        return _knots.near_end(self.listed, t0, t1)
 
 
 class Problem(eqx.Module):

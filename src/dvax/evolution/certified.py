@@ -291,16 +291,29 @@ def _outside(t: float) -> InputError:
 
 def _check_knots(setup: Setup) -> None:
     """Raise if steps do not end at all knots of the data."""
-    t0, t1 = setup.setting["t0"], setup.setting["t1"]
-    knots = setup.problem.data_knots(t0, setup.x0, _tree.as_arrays(setup.args))
-    near = knots.near_ends(t0, t1, float(jnp.finfo(setup.dtype).eps))
-    if near:
+    near = knot_near_end(setup)
+    if np.isfinite(near):
         raise input_error(
             "dvax.solve(certified_tol)",
-            f"data that may jump at t = {near[0]:.17g}, some roundings of t from an end of the run",
+            f"data that may jump at t = {near:.17g}, some roundings of t from an end of the run",
             "no step ends there, so that the jump is in no bound",
             "Let the run start or end there, or measure time from a later origin",
         )
+
+
+def knot_near_end(setup: Setup) -> float:
+    """Return the first knot of the data so close to an end of the run that no step ends there; infinity
+    without one."""
+    times = setup.setting["t0"], setup.setting["t1"]
+    numbers, signature = flatten((setup.problem,), (times, setup.x0, setup.args), None)
+    return float(np.asarray(_knot_near_end(numbers, signature)))
+
+
+@partial(jax.jit, static_argnums=1)
+def _knot_near_end(numbers: list[Any], signature: Signature) -> jax.Array:
+    (problem,), (times, x0, args) = signature.unflatten(numbers)
+    t0, t1 = (jnp.asarray(t, _tree.dtype(x0)) for t in times)
+    return problem.data_knots(t0, x0, _tree.as_arrays(args)).near_end(t0, t1)
 
 
 def _check_domain(problem: Problem, constants: Any, args: Any, t0: float, t1: float) -> None:
@@ -318,8 +331,8 @@ def _check_domain(problem: Problem, constants: Any, args: Any, t0: float, t1: fl
     if domain is not None and not domain.has_args(args, Reads(problem)):
         wrong.add(
             "dvax.solve(constants)",
-            "constants of another problem, of other args, or of other values that f, h or K reads from "
-            "around it",
+            "constants of another problem or another args, or of other values that f, h or K reads "
+            "from around it",
             "f and h may be steeper at these parameters than at those",
             "Verify for these: dvax.verify(problem, x0, t0, t1, args)",
         )

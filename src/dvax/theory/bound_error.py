@@ -3,13 +3,13 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from .. import _tree
 from .._captured import current
 from ..errors import input_error
 from ..evolution import Solution
+from ..evolution.certified import knot_near_end
 from ..problem import Problem
 from .along import bound_along
 from .certificate import Bound, bound_by_constants, check_bounded
@@ -79,7 +79,7 @@ def bound_error(
     ```
     """
     if constants is not None:
-        return _checked(problem, bound_by_constants(problem, sol, constants, initial_error), sol)
+        return _checked(bound_by_constants(problem, sol, constants, initial_error), sol)
     problem = current(problem)
     check_bounded(problem, sol, initial_error)
     error = initial_error.x[-1] if isinstance(initial_error, Bound) else initial_error
@@ -93,21 +93,19 @@ def bound_error(
             "dvax.bound_error(sol)", "no saved time", "a bound exists at saved times only",
             "Save the end of the run: ts=[t1]",
         )  # fmt: skip
-    return _checked(problem, bound_along(problem, sol, float(np.asarray(error))), sol)
+    return _checked(bound_along(problem, sol, float(np.asarray(error))), sol)
 
 
-def _checked(problem: Problem, bound: Bound, sol: Solution) -> Bound:
+def _checked(bound: Bound, sol: Solution) -> Bound:
     """Return the bound, which is estimated if steps do not end at all knots of the data."""
     setup = sol.setup
-    t0, t1 = setup.setting["t0"], setup.setting["t1"]
-    if not _tree.is_concrete(t0, t1, setup.args):
+    if not _tree.is_concrete(setup.problem, setup.setting, setup.x0, setup.args):
         return bound
-    knots = problem.data_knots(t0, setup.x0, _tree.as_arrays(setup.args))
-    near = knots.near_ends(t0, t1, float(jnp.finfo(sol.ts.dtype).eps))
-    if not near:
+    near = knot_near_end(setup)
+    if not np.isfinite(near):
         return bound
     why = (
-        f"the data may jump at t = {near[0]:.17g}, some roundings of t from an end of the run, where "
+        f"the data may jump at t = {near:.17g}, some roundings of t from an end of the run, where "
         "no step ends. A run from there, or to there, has a proved bound"
     )
     return dataclasses.replace(
