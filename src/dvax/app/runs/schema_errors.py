@@ -53,12 +53,12 @@ def translate(
 ) -> list[InputProblem]:
     """One problem for each key: file and dotted key, what was given, the rule, the fix."""
     groups: dict[tuple[str | int, ...], list[dict[str, Any]]] = {}
-    for found in map(dict, error.errors(include_url=False)):
-        path = list(found["loc"])
+    for one in error.errors(include_url=False):
+        found, path = dict(one), list(one["loc"])
         at = _alternative(model, path)
         # Of a key with several types pydantic has an error for each of them, named in the path.
-        groups.setdefault(tuple(path[:at]), []).append(found)
         found["loc"] = tuple(path if at is None else path[:at] + path[at + 1 :])
+        groups.setdefault(tuple(path[:at]), []).append(found)
     return [_joined(group, file, section, model) for group in groups.values()]
 
 
