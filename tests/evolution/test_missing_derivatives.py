@@ -104,3 +104,20 @@ def test_random_keys_are_parameters_as_others(where):
     found = dvax.verify(coupled(g), jnp.ones(2), 0.0, 1.0, args)
     assert found.constants.alpha_f >= 0.99 * np.linalg.norm(W, 2)
     assert float(dvax.bound_error(coupled(g), sol).x[-1]) < 1e-4
+
+
+@pytest.mark.slow
+def test_where_each_method_fails_the_reason_is_told_and_not_stability():
+    """Stability limits the first method long before √(2 − t) ends every run."""
+
+    def f(t, x, u, args):
+        away = x - jnp.cos(t)
+        return -1e4 * away**3 - 1e5 * away + u * jnp.sqrt(2.0 - t)
+
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0), f=f,
+        h=lambda t, x, u, args: 0.3 * x,
+    )  # fmt: skip
+    with pytest.raises(dvax.SolveError, match="NaN") as caught:
+        dvax.solve(problem, 1.0, 0.0, 4.0)
+    assert caught.value.solution.result == dvax.RESULTS.nonfinite

@@ -426,9 +426,10 @@ def _run_chosen(
             for other in [] if reached else choice.after(solution.result):
                 again = setup._replace(method=other.method)
                 second, reached = _differentiably(again, times, options)
-                # A method that stability limits may need more steps than there may be.
-                is_stiff = solution.result == RESULTS.stiff and second.result == RESULTS.max_steps
-                if reached or is_stiff:
+                # Of a run that stability limited, another failure is the one to report: that of too
+                # many steps, or of the method that was chosen.
+                is_last = second.result == RESULTS.max_steps or other.method is choice.method
+                if reached or (solution.result == RESULTS.stiff and is_last):
                     text, solution = other.text(f" at t = {t:.6g}"), second
                     break
             solution.stats["method"] = text
