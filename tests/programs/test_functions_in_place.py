@@ -73,7 +73,7 @@ def test_values_outside_of_a_table_are_in_the_bound(dt):
     )
     # Exact from jump to jump: 0.3x is inside K while |x| ≤ 10/3, and 1 beyond.
     times, values = [0.0, 0.3, 1.9 / 3.0, 2.9 / 3.0, 2.0], [1.0, 2.0, 3.0, 1000.0]
-    exact, x = [], 0.0
+    exact = []
     for t in ts:
         x = 0.0
         for a, b, v in zip(times, times[1:], values, strict=False):
@@ -82,7 +82,7 @@ def test_values_outside_of_a_table_are_in_the_bound(dt):
         exact.append(x)
     error = np.abs(np.asarray(sol.xs) - exact)
     for bound in (dvax.bound_error(problem, sol, constants), dvax.bound_error(problem, sol)):
-        assert (error <= np.asarray(bound.x) * (1.0 + 1e-9)).all()
+        assert (error <= np.asarray(bound.x)).all()
 
 
 def _after(x, span, v):

@@ -189,7 +189,7 @@ def roundoff(space: AbstractSpace, A: AbstractGenerator, arc: FlowStep, inset: A
     Propagation and summation are taken to have relative errors of `ROUNDINGS` ε, and so is the length h
     of the step, on which x depends as h‖x'‖. At both ends f̃ is evaluated within the step, in all by
     `inset` away from them: f̃ is then the polynomial Σcₖθᵏ with another θ, which changes it by less than
-    2 Σk‖cₖ‖ inset/h. (After decay Ax is smooth at the end of the step, which it may not be before.)
+    2 Σk‖cₖ‖ inset/h. In a step of an analytic semigroup h‖Ax‖ is of the size of ‖x‖, and is left out.
     """
     h, x0, x1, c = lax.stop_gradient(values(tuple(arc)))
     size = jnp.maximum(space.norm(x0), space.norm(x1))

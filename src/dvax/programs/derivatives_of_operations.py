@@ -37,11 +37,11 @@ def of_operations(fn: Callable[..., Any], *arguments: Any) -> Callable[..., Any]
 
 
 def has_derivative(fn: Callable[..., Any], *arguments: Any) -> bool:
-    """Return whether JAX has a derivative of fn, as it has not of callbacks and of `x.at[i].apply`."""
+    """Return whether JAX has a derivative of fn. It has none of a callback, nor of `x.at[i].apply`."""
     try:
         jax.eval_shape(lambda *given: jax.jvp(fn, given, given)[1], *arguments)
     except (NotImplementedError, ValueError, TypeError):
-        return False
+        return False  # by the operation JAX raises the first, and of callbacks and own rules the others
     return True
 
 

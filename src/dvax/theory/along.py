@@ -117,27 +117,14 @@ class BoundAlong:
         a, at_kink = self.t, self.unknown >= _MAX_AT_KINK
         piece = self.tube.piece(a, b, saved, self.before, self.initial_error)
         self.steps += self.tube.latest_steps
-        if self.max_steps is not None and self.steps > self.max_steps:
-            self.why = (
-                f"the trajectory along which it is proved took {self.steps} steps to t = {b:.6g}"
-            )
-        elif self.max_steps is not None:
-            # Steps of order 2 are as long as the root of the tolerance. A piece that is too long is not
-            # like those that follow.
-            left = (self.end - b) / (b - a) if isinstance(piece, Piece) else 1.0
-            expected = self.tube.latest_steps * left
-            self.tube.loosen((expected / (self.max_steps - self.steps + 1)) ** 2)
-        if self.why and isinstance(piece, str):
-            return None
-        if (
-            not self.why
-            and b - a > _SHORTEST * self.span
-            and (isinstance(piece, str) or piece.excess(b - a, self.span, at_kink) > 1.0)
-        ):
+        # A piece that is too long is not like those that follow.
+        self._limit_steps(b, (self.end - b) / (b - a) if isinstance(piece, Piece) else 1.0)
+        is_too_long = isinstance(piece, str) or piece.excess(b - a, self.span, at_kink) > 1.0
+        if is_too_long and not self.why and b - a > _SHORTEST * self.span:
             self.length = 0.5 * (b - a)
             return None
         if isinstance(piece, str):
-            self.why = f"{piece}, from t = {a:.6g} to t = {b:.6g}"
+            self.why = self.why or f"{piece}, from t = {a:.6g} to t = {b:.6g}"
             return None
         size = float(self.problem.spaces(piece.sol.setup.x0)[0].norm(_last(piece.sol.xs)))
         if piece.x[-1] > _USELESS * (1.0 + size):
@@ -148,6 +135,19 @@ class BoundAlong:
             self.length = min(2.0 * self.length, self.span / 8)
         self.t, self.before = b, piece
         return piece
+
+    def _limit_steps(self, b: float, more: float) -> None:
+        """Say that x_c had too many steps, or loosen its tolerance for `more` pieces like the last."""
+        if self.max_steps is None:
+            return
+        left = self.max_steps - self.steps
+        if left < 0:
+            self.why = (
+                f"the trajectory along which it is proved took {self.steps} steps to t = {b:.6g}"
+            )
+        else:
+            # Steps of order 2 are as long as the root of the tolerance.
+            self.tube.loosen((more * self.tube.latest_steps / (left + 1)) ** 2)
 
 
 def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
