@@ -70,8 +70,9 @@ class Sample(NamedTuple):
 
 
 def enclosed(
-    flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: FlowStep, last: Rate, span: Any
-) -> Sample:
+    flow: Flow, growth: Growth, ends: tuple[Any, Any], arc: FlowStep, rates: tuple[Rate, Rate],
+    span: Any,
+) -> Sample:  # fmt: skip
     """|δ(θ)| ≤ (1−θ)(|δ(0)| + dev) + θ(|δ(1)| + dev) entry by entry, with dev from a linear
     enclosure, since p is a line; so ∫‖δ‖ is at most the mean of the norms of the two brackets
     (the norm of their mean would be too little: ends may lie in different entries). δ(0) is
@@ -79,14 +80,18 @@ def enclosed(
 
     Where an entry has no bound, as next to the zero of |s|^1.5, the defect is infinite, and so is what
     it certifies; in a step that is short in a run of this `span` the step control goes by how far f̃
-    moves from one end to the other."""
+    moves from one end to the other.
+
+    The response may differ from the u of the enclosure, by what `flow` bounds: this is the defect of
+    the law."""
     ends, arc, growth, span = lax.stop_gradient((ends, arc, growth, span))
     h, x0, x1, c = values(tuple(arc))
     short = h <= TRUSTED_STEP_SHARE * span
     space = flow.state_space(x0)
     bend = flow.generator.chord_deviation(arc, space, growth)
     x = jtu.tree_map(LinearEnclosure, x0, x1, bend)
-    along, u = flow.enclosure(LinearEnclosure(*ends, jnp.zeros_like(h)), x)
+    time = LinearEnclosure(*ends, jnp.zeros_like(h))
+    along, u, law_residual, apart, effect = flow.enclosure(time, x, *rates)
     at_start = jtu.tree_map(
         lambda q, p: jnp.abs(q.a - p) + q.dev, along, c[0], is_leaf=is_enclosure
     )
@@ -101,7 +106,16 @@ def enclosed(
     settles = short & jnp.isfinite(size) & (most(varies) * span <= _SETTLES * size)
     error = jtu.tree_map(lambda e, v: jnp.where(settles & (e == jnp.inf), v, e), error, varies)
     defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
-    return Sample((), [last], error, defect, jnp.zeros_like(defect), Bounds.of_enclosures(x, u))
+    if flow.interpolated:
+        # Any part of f̃ may have the effect.
+        error = jtu.tree_map(lambda e: e + effect / jnp.sqrt(space.size()), error)
+        control = flow.problem.spaces(x0)[1]
+        u = jtu.tree_map(
+            lambda q, w: q._replace(dev=q.dev + apart / jnp.sqrt(w)), u, control.weights(),
+            is_leaf=is_enclosure,
+        )  # fmt: skip
+    bounds = Bounds.of_enclosures(x, u)
+    return Sample((), [rates[1]], error, defect, h * law_residual, bounds)
 
 
 def sampled(

@@ -30,6 +30,7 @@ from ..sets._library import is_of_library
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
 from ..vi.known import Known
+from .interpolated_response import Place, interpolated
 from .law_tolerance import LawTolerance
 from .linearised import AbstractLinear, finite, linearise
 from .small_box import AbstractSmallBox
@@ -43,7 +44,8 @@ class Rate(NamedTuple):
 
     `value` = f(t, x, u); y = P u; `z`, whose projection onto K is y (both None where not kept);
     `residual` = ‖w‖ of the frozen solve; `solved`, whether it met its tolerance; `evaluations` of F;
-    `switches`, the switch functions of K at z, where the flow keeps them (`Flow.keeps_switches`).
+    `switches`, the switch functions of K at z, where the flow keeps them (`Flow.keeps_switches`);
+    `nearest`, the projection of z where y is only close to it and the flow is `interpolated`.
     """
 
     value: Tree
@@ -53,6 +55,19 @@ class Rate(NamedTuple):
     solved: jax.Array
     evaluations: jax.Array
     switches: list[jax.Array] | None = None
+    nearest: Tree | None = None
+
+
+class EnclosedRate(NamedTuple):
+    """Enclosures over a step: of f(t, x, u) in `value`, of a line or of the response in `u`; and bounds
+    on the distance of the response from this u: `law_residual`/γ for y, `apart` for all u, and
+    `effect` of it on f̃ (0 if u is the response)."""
+
+    value: Tree
+    u: Tree
+    law_residual: jax.Array
+    apart: jax.Array
+    effect: jax.Array
 
 
 class Flow(eqx.Module):
@@ -65,7 +80,8 @@ class Flow(eqx.Module):
     program takes a compiler a second or ten for every place that contains it.
     `reciprocal` is 1/a where a was proved not to depend on t and x, so that it is computed once.
     `enclosed` says that f̃ has a linear enclosure over a whole step, so that nothing about the defect
-    is guessed. `linear` is A + J where some J joins A in what is left to the propagator.
+    is guessed. If it is `interpolated`, this one is made from the responses at both ends of the step.
+    `linear` is A + J where some J joins A in what is left to the propagator.
     With `keeps_switches`, `rate` also returns the switch functions of a law that `iterates`, so that
     they are compiled once with it and not wherever they are read. `pointwise` says
     that each entry of f̃ depends on t and on that entry of x alone. `prepared` is K, with what does not
@@ -81,9 +97,11 @@ class Flow(eqx.Module):
     iterates: bool = eqx.field(static=True)
     reciprocal: Tree | None
     enclosed: bool = eqx.field(static=True)
+    interpolated: bool = eqx.field(static=True)
     tol: LawTolerance
     gamma: Any
     L_F: Any
+    norm_P_inv: Any
     small_box: AbstractSmallBox | None = None
     linear: AbstractLinear | None = None
     keeps_switches: bool = eqx.field(static=True, default=False)
@@ -200,13 +218,36 @@ class Flow(eqx.Module):
 
         return self.tol(x, effect, y)
 
-    def enclosure(self, t: LinearEnclosure, x: Tree) -> tuple[Tree, Tree]:
-        """Return linear enclosures of f̃ and u, given those of t and x.
-
-        The law is direct, on pointwise intervals.
+    def enclosure(
+        self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
+    ) -> EnclosedRate:
+        """Return enclosures of f̃ and of the response over a step, given those of t and x, and the rates
+        at its ends if the response is `interpolated`.
 
         **Raises:** `NoEnclosure` where f, h or K uses an operation without a rule.
         """
+        problem, args = self.problem, self.args
+        if not self.interpolated:
+            u = self._enclosed_response(t, x)
+            zero = jnp.zeros_like(t.dev)
+            value = enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u)
+            return EnclosedRate(value, u, zero, zero, zero)
+        assert first is not None and last is not None
+        places = self._place(t.a, x, first), self._place(t.b, x, last)
+        line = interpolated(problem, args, self.operator, t, x, places, self.gamma, self.L_F)
+        value = enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, line.u)
+        apart, effect = self.norm_P_inv * line.apart, self.tol.gain * line.apart
+        return EnclosedRate(value, line.u, line.residual, apart, effect)
+
+    def _place(self, t: Any, x: Tree, rate: Rate) -> Place:
+        start = jtu.tree_map(lambda line: line.a, x, is_leaf=is_enclosure)
+        y = rate.nearest
+        if y is None:
+            y = self.set_at(t).project(rate.z, self.problem.spaces(start)[1])
+        return jax.lax.stop_gradient(Place(rate.z, y, rate.switches))
+
+    def _enclosed_response(self, t: LinearEnclosure, x: Tree) -> Tree:
+        """Return the enclosure of the response of a law in closed form, on pointwise intervals."""
         problem, args, P = self.problem, self.args, self.operator
         start = jtu.tree_map(lambda line: line.a, x, is_leaf=is_enclosure)
         zero = problem.zero_control(start)
@@ -218,8 +259,7 @@ class Flow(eqx.Module):
         y = jtu.tree_map(
             lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
         )
-        u = enclose(P.inverse, y)
-        return enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u), u
+        return enclose(P.inverse, y)
 
     def switches_of(self, t: Any, x: Tree, rate: Rate) -> list[jax.Array] | None:
         """`switch_parts` at (t, x), whose rate this is."""
@@ -284,7 +324,10 @@ def _by_loop(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     however many places of a step ask for it."""
     rate = flow._closed_form(t, x) if flow.direct else _solved(flow, t, x, guess)
     switches = flow.switch_parts(t, x, rate.z) if flow.keeps_switches else None
-    return rate._replace(switches=jax.lax.stop_gradient(switches))
+    nearest = None
+    if flow.interpolated:
+        nearest = flow.set_at(t).project(rate.z, flow.problem.spaces(x)[1])
+    return rate._replace(**jax.lax.stop_gradient({"switches": switches, "nearest": nearest}))
 
 
 def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:

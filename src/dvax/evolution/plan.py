@@ -8,15 +8,19 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._jax.jaxprs import has_loop
-from ..programs.enclosure import constant, has_enclosure
+from ..programs.enclosure import constant, enclose, has_enclosure
 from ..vi import AbstractSolver, Auto, analyse, independent
 from .flow import Flow, slope
 from .implicit import Implicit
+from .interpolated_response import is_polyhedral
 from .law_tolerance import law_tolerance
 from .linearised import NoJacobian
 from .method import AbstractMethod
 from .setup import Setup
 from .small_box import AbstractSmallBox, is_small, small_box
+
+_MODULI = {"gamma", "L_F", "norm_P_inv", "law_gain"}
+"""Moduli by which the response between two ends of a step is enclosed."""
 
 
 class Plan(NamedTuple):
@@ -29,7 +33,8 @@ class Plan(NamedTuple):
       and a formula solves it;
     - `iterates`: the law, or the projection of its closed form, is computed by a loop;
     - `solver`: the solver of the law that `dvax.vi.Auto` chose, None if the user gave one;
-    - `enclosed`: f̃ has an enclosure over a whole step, so that the defect is not sampled.
+    - `enclosed`: f̃ has an enclosure over a whole step, so that the defect is not sampled;
+    - `interpolated`: this enclosure is made from the responses at the ends of the step.
     """
 
     closed_form: bool
@@ -39,15 +44,27 @@ class Plan(NamedTuple):
     iterates: bool
     solver: AbstractSolver | None
     enclosed: bool
+    interpolated: bool
 
     @staticmethod
     def of(setup: Setup) -> "Plan":
         """Return the plan from the code of f, h and K, traced at the start of the run."""
+        plan = Plan._of_law(setup)
+        if isinstance(setup.method, Implicit) or setup.method.degree > 1:
+            return plan
+        if plan.closed_form and _is_enclosed(setup, plan):
+            return plan._replace(enclosed=True)
+        interpolated = _is_interpolated(setup)
+        return plan._replace(enclosed=interpolated, interpolated=interpolated)
+
+    @staticmethod
+    def _of_law(setup: Setup) -> "Plan":
+        """Return the plan without an enclosure."""
         problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
         args = _tree.as_arrays(setup.args)
         like = problem.zero_control(x0)
         if not isinstance(setup.vi_solver, Auto):
-            return Plan(False, False, False, False, True, None, False)
+            return Plan(False, False, False, False, True, None, False, False)
         K, frozen = problem.set_at(t0, args), problem.frozen(t0, x0, args)
         structure, is_box = analyse(frozen, like), K.intervals(like) is not None
         solver = setup.vi_solver.choose(frozen, K, like)
@@ -56,20 +73,15 @@ class Plan(NamedTuple):
             jacobian = lambda t, x: jax.jacfwd(problem.frozen(t, x, args))(like)  # noqa: E731
             affine = structure.affine and is_box and is_small(like)
             solved_by_formula = affine and independent(jacobian, t0, x0)
-            return Plan(
-                False, False, False, solved_by_formula, not solved_by_formula, solver, False
-            )
+            iterates = not solved_by_formula
+            return Plan(False, False, False, solved_by_formula, iterates, solver, False, False)
         operator = problem.operator(args)
         constant_slope = independent(lambda t, x: slope(problem, operator, t, x, args), t0, x0)
         project = lambda z: K.project(z, problem.spaces(x0)[1])  # noqa: E731
         iterates = not is_box and has_loop(jax.make_jaxpr(project)(like))
-        plan = Plan(True, structure.isotropic, constant_slope, False, iterates, solver, False)
-        line = not isinstance(setup.method, Implicit) and setup.method.degree <= 1
-        if not (intervals and line):
-            return plan
-        flow = plan.flow(setup)
-        enclosed = has_enclosure(lambda t, x: flow.enclosure(constant(t), constant(x)), t0, x0)
-        return plan._replace(enclosed=enclosed)
+        return Plan(
+            True, structure.isotropic, constant_slope, False, iterates, solver, False, False
+        )
 
     def flow(self, setup: Setup) -> Flow:
         """Return the reduced map f̃ for the numbers of this call."""
@@ -92,12 +104,49 @@ class Plan(NamedTuple):
             iterates=self.iterates,
             reciprocal=reciprocal,
             enclosed=self.enclosed,
+            interpolated=self.interpolated,
             tol=law_tolerance(setup),
             gamma=setup.moduli.get("gamma"),
             L_F=setup.moduli.get("L_F"),
+            norm_P_inv=setup.moduli.get("norm_P_inv"),
             small_box=_small_box(setup) if self.small_box else None,
             linear=NoJacobian(generator) if explicit else None,
         )
+
+
+def _is_enclosed(setup: Setup, plan: Plan) -> bool:
+    """Return whether f̃ has an enclosure by the rules for its operations: for a law in closed form on
+    pointwise intervals."""
+    problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
+    if problem.set_at(t0, _tree.as_arrays(setup.args)).intervals(problem.zero_control(x0)) is None:
+        return False
+    flow = plan.flow(setup)
+    enclosure = lambda t, x: flow.enclosure(constant(t), constant(x), None, None)  # noqa: E731
+    return has_enclosure(enclosure, t0, x0)
+
+
+def _is_interpolated(setup: Setup) -> bool:
+    """Return whether the response over a step is enclosed from its values at the ends: if the moduli
+    of the law are known, f and h have enclosures, and K is a box, or a polyhedral set that does not
+    move."""
+    if not _MODULI <= set(setup.moduli):
+        return False
+    problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
+    args, like = _tree.as_arrays(setup.args), problem.zero_control(x0)
+    K = problem.set_at(t0, args)
+    if not is_polyhedral(K, like):
+        return False
+    functions = [problem.f, problem.h]
+    if K.intervals(like) is not None:
+        functions.append(lambda t, x, u, args: problem.set_at(t, args).intervals(like))
+    elif not independent(lambda t: jtu.tree_leaves(problem.set_at(t, args)), t0):
+        return False
+    return all(
+        has_enclosure(
+            lambda *at, fn=fn: enclose(lambda *at: fn(*at, args), *map(constant, at)), t0, x0, like
+        )
+        for fn in functions
+    )
 
 
 def _small_box(setup: Setup) -> AbstractSmallBox:

@@ -604,7 +604,7 @@ class Stepper(eqx.Module):
 
     def _kept(self, rate: Rate) -> Rate:
         """What the next step needs of a rate: not the law behind it, where nothing samples it."""
-        if not self.flow.enclosed:
+        if not self.flow.enclosed or self.flow.interpolated:
             return rate
         return rate._replace(y=None, z=rate.z if self.locate else None)
 
@@ -629,7 +629,8 @@ class Stepper(eqx.Module):
             begin = jnp.where(jumped, begin, 2.0 * t0 - begin)
             ends = begin, self._one_sided_time(t0, t1, 1.0)
             span = self.ends[1] - self.ends[0]
-            sample = enclosed(self.flow, self.growth, ends, arc, evaluations[-1].rate, span)
+            rates = evaluations[0].rate, evaluations[-1].rate
+            sample = enclosed(self.flow, self.growth, ends, arc, rates, span)
         space = self.flow.state_space(values(arc.x1))
         first, last = (self._one_sided_time(t0, t1, theta) for theta in (0.0, 1.0))
         inset = lax.stop_gradient((first - t0) + (t1 - last))

@@ -159,7 +159,8 @@ def _stepper(
         pointwise = is_pointwise(flow.problem, flow.operator, t0, setup.x0, flow.args)
         flow = dataclasses.replace(flow, pointwise=pointwise)
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
-    flow = dataclasses.replace(flow, keeps_switches=locate and flow.iterates)
+    keeps_switches = flow.iterates and (locate or flow.interpolated)
+    flow = dataclasses.replace(flow, keeps_switches=keeps_switches)
     watch = not options.fixed and measure and not flow.enclosed
     guard = excursions.guard(flow, t0, setup.x0) if watch else None
     stepper = Stepper(

@@ -147,13 +147,41 @@ def disturbances(problem: Problem, sol: Solution, c: Constants) -> tuple[Disturb
     args, t0 = _tree.as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     of_x, of_u = _roundoff(current(problem), args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
     law = sol.law_residual, sol.law_step, of_u
-    assert sol.completed_defect is not None
     total, completed = (
         np.asarray(disturbance(c, *(np.asarray(v, float) for v in parts)))
-        for parts in ((sol.defect, sol.law_defect), sol.completed_defect)
+        for parts in _defects(sol, c)
     )
     of_law = _law_error(c, *(np.asarray(v, float) for v in law))
     return Disturbances(total, completed, np.asarray(of_x, float)), np.asarray(of_law)
+
+
+def encloses_by(sol: Solution, c: Constants, otherwise: bool = False) -> bool:
+    """Return whether enclosures of the response, which rest on the moduli that the problem was solved
+    with, hold by these constants; `otherwise` if the moduli are traced.
+
+    The larger γ, and the smaller L_F and ‖P⁻¹‖, the sharper they are."""
+    if sol.plan is None or not sol.plan.interpolated:
+        return True
+    used = sol.setup.moduli
+    pairs = (
+        (used["gamma"], c.gamma), (c.L_F, used["L_F"]), (c.norm_P_inv, used["norm_P_inv"]),
+    )  # fmt: skip
+    if not _tree.is_concrete(pairs):
+        return otherwise
+    return all(float(sharp) <= float(proved) for sharp, proved in pairs)
+
+
+def _defects(sol: Solution, c: Constants) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """Return the integrated defects of state and law at the saved times, and at the start of the step
+    that contains each of them."""
+    assert sol.defect is not None and sol.law_defect is not None
+    assert sol.completed_defect is not None
+    if sol.plan is None or not sol.plan.interpolated:
+        return (sol.defect, sol.law_defect), sol.completed_defect
+    # The defect of the law is ρ(γ), and ρ(γ)/γ bounds an error for the γ with which it was found.
+    ratio = c.gamma / sol.setup.moduli["gamma"]
+    (total, law), (before, law_before) = (sol.defect, sol.law_defect), sol.completed_defect
+    return (total, ratio * law), (before, ratio * law_before)
 
 
 def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial: tuple) -> Bound:
@@ -162,16 +190,17 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     measured, distance = sol, jnp.zeros_like(sol.ts)
     domain = constants.domain
     regional = domain is not None and not domain.is_unbounded
-    if sol.defect is None or (regional and sol.bounds is None):
+    if (
+        sol.defect is None
+        or (regional and sol.bounds is None)
+        or not encloses_by(sol, constants, otherwise=True)
+    ):
         measured = _solve_again(sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     args, t0 = _tree.as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
     of_x, of_u = _roundoff(problem, args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
     distance = _tree.prepare(operator.add, distance, of_x)
-    assert measured.defect is not None and measured.law_defect is not None
-    assert measured.completed_defect is not None
-
-    defects = (measured.defect, measured.law_defect), measured.completed_defect
+    defects = _defects(measured, constants)
     law = sol.law_residual, sol.law_step, of_u
     estimates, integrals = _estimates(constants, t0, sol.ts, defects, initial)
     x, u, x_sharp, u_sharp = _bounds(constants, estimates, distance, law)
@@ -197,7 +226,7 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
             why = _exit(domain, sol.ts, inside, values, rates)
     status = weakest(
         constants.status_of(*(name for name, _ in constants.statuses)),
-        "proved" if measured.enclosed else "estimated",
+        "proved" if measured.enclosed and encloses_by(measured, constants) else "estimated",
         _status_of_structure(problem, sol, constants),
         domain_status,
     )

@@ -4,13 +4,14 @@ Let e = x_c − x, and v = u_c − u the difference of the responses. By the mea
 
     e' = (A + F_x)e + F_u v + δ,
 
-with ∂f/∂x and ∂f/∂u enclosed over a box that contains both trajectories. For K a box, v follows from e.
-With w = P(u_c − u), N = (I − ∂h/∂u)P⁻¹ and any ρ > 0, the law is a projection of y + ρ(h − P⁻¹y), so
+with ∂f/∂x and ∂f/∂u enclosed over a box that contains both trajectories. v follows from e. With
+w = P(u_c − u), N = (I − ∂h/∂u)P⁻¹ and any ρ > 0, the law is a projection of y + ρ(h − P⁻¹y), so
 
-    w = D[(I − ρN)w + ρ ∂h/∂x e],   D diagonal, 0 ≤ D ≤ 1:
+    w = D[(I − ρN)w + ρ ∂h/∂x e],   0 ≤ D ≤ 1.
 
-Dᵢ = 1 where yᵢ is inside its interval all the time, and Dᵢ = 0 where (h − u)ᵢ has one sign, so that yᵢ
-is at an end of it; elsewhere Dᵢ is unknown. Centers of the enclosures give v = Ve + …, and so
+For a polyhedral set `faces` has bounds on D. For a box D is diagonal: Dᵢ = 1 where yᵢ is inside its
+interval all the time, and Dᵢ = 0 where (h − u)ᵢ has one sign, so that yᵢ is at an end of it; elsewhere
+Dᵢ is unknown. Centers of the enclosures give v = Ve + …, and so
 
     |e' − Ce − δ| ≤ R|e| + W|(w/‖P‖, v)|,   C = A + F_x + F_u V,
 
@@ -24,7 +25,8 @@ import numpy as np
 from .. import _tree
 from ..programs.slope import TooLarge, Values
 from .blocks import Block, as_one_matrix, identity, norms
-from .local_derivatives import Derivatives, Range
+from .faces import Range, derivatives_on_faces
+from .local_derivatives import Derivatives
 from .system import System
 from .weights import roots
 
@@ -37,7 +39,7 @@ _SEPARATION = 1e-12
 
 class Linearisation(NamedTuple):
     """|e' − Ce − δ| ≤ R|e| + W|g| entry by entry, with ‖g‖ ≤ √2 L‖e‖, and ‖v‖ ≤ gain·‖e‖, in
-    coordinates in which norms are Euclidean; `knows_law`: every entry of D is known.
+    coordinates in which norms are Euclidean; `knows_law`: D is known.
 
     All are stacks, with one entry for each interval of time, but L."""
 
@@ -97,18 +99,16 @@ def _response(
 ) -> tuple[Values, Block, Values, Values] | None:
     """Return Q, G and T with |v − QGe| ≤ |Q|T|w| for an enclosed G, and whether D is known; None if K
     is not a box."""
-    if J.ends is None:
+    derivative = _derivative_of_projection(J, system, P.center[0])
+    if derivative is None:
         return None
-    low, high = _derivative_of_projection(J, J.ends, system, P.center[0])
+    D, is_known = derivative
     eye = identity(P)
     N = eye.plus(J.h_u, -1.0) @ P_inv
     sizes = np.linalg.svd(N.center, compute_uv=False)
     rho = (2.0 / (sizes[:, 0] + sizes[:, -1]))[:, None, None]
-    diagonal = Block(
-        *(v[:, :, None] * eye.center for v in (0.5 * (low + high), 0.5 * (high - low)))
-    )
-    G = (diagonal @ J.h_x).times(rho)
-    product = diagonal @ eye.plus(N.times(rho), -1.0)
+    G = (D @ J.h_x).times(rho)
+    product = D @ eye.plus(N.times(rho), -1.0)
     try:
         inverse = np.linalg.inv(eye.center - product.center)
     except np.linalg.LinAlgError:
@@ -116,19 +116,37 @@ def _response(
     # The inverse is rounded.
     rest = np.abs(eye.center - inverse @ (eye.center - product.center))
     T = product.radius + np.abs(eye.center - product.center) @ rest
-    return P_inv.center @ inverse, G, T, (low == high).all(axis=1)
+    return P_inv.center @ inverse, G, T, is_known
 
 
 def _derivative_of_projection(
-    J: Derivatives, ends: tuple[Range, Range], system: System, P: Values
-) -> tuple[Values, Values]:
-    """Return bounds on the entries of D, with a row for each box."""
+    J: Derivatives, system: System, P: Values
+) -> tuple[Block, Values] | None:
+    """Return D for each box, and whether it is known; None if K has no rule."""
     root = np.concatenate(roots(system.control, system.u0))
+    separation = max(_SEPARATION, 64.0 * float(np.finfo(_tree.dtype(system.u0)).eps))
+    if J.ends is not None:
+        low, high = _entries_on_box(J, J.ends, root, separation, P)
+        center, radius = 0.5 * (low + high), 0.5 * (high - low)
+        eye = np.eye(len(root))
+        return Block(center[:, :, None] * eye, radius[:, :, None] * eye), (low == high).all(axis=1)
+    K = system.conditions
+    if K is None:
+        return None
+    u, h = (Range(root * v.low, root * v.high) for v in (J.u, J.h))
+    center, half = u.image(P)
+    y, force = Range(center - half, center + half), Range(h.low - u.high, h.high - u.low)
+    return derivatives_on_faces(K._replace(R=K.R / root), y, force, separation)
+
+
+def _entries_on_box(
+    J: Derivatives, ends: tuple[Range, Range], root: Values, separation: float, P: Values
+) -> tuple[Values, Values]:
+    """Return bounds on the entries of D for a box, with a row for each box of u and h."""
     (u_low, u_high), (h_low, h_high) = ((root * v.low, root * v.high) for v in (J.u, J.h))
     low, high = ends
     # u is P⁻¹y with rounding errors, which must not look like a distance of y from its bounds.
     size = np.maximum(np.abs(u_low), np.abs(u_high))
-    separation = max(_SEPARATION, 64.0 * float(np.finfo(_tree.dtype(system.u0)).eps))
     half = (0.5 * (u_high - u_low) + separation * size) @ np.abs(P).T
     middle = (0.5 * (u_low + u_high)) @ P.T
     is_inside = (middle - half > root * low.high) & (middle + half < root * high.low)

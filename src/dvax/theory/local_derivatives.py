@@ -24,8 +24,9 @@ from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
 from ..programs.derivatives_of_operations import of_operations
-from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, columns, interval
+from ..programs.slope import Slope, SlopeEnclosure, TooLarge, columns, interval
 from .blocks import Block, as_one_matrix
+from .faces import Range
 from .projection_speed import slopes
 from .region import Region
 from .system import System
@@ -36,13 +37,6 @@ MAX_UNKNOWNS = 40
 
 _ROUNDINGS = 500.0
 """Relative rounding errors of an entry of J, as a multiple of the unit roundoff."""
-
-
-class Range(NamedTuple):
-    """Values between two arrays."""
-
-    low: Values
-    high: Values
 
 
 class Derivatives(NamedTuple):

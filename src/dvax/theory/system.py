@@ -12,6 +12,9 @@ from jax.flatten_util import ravel_pytree
 from .._tree import Tree
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval
+from ..programs.structure import independent
+from ..sets._conditions import Conditions, conditions
+from ..sets._library import is_of_library
 from .blocks import Block, block, identity
 from .region import Region
 from .weights import roots
@@ -103,6 +106,16 @@ class System:
             return None
         low, high = self._intervals(time).out
         return low, high
+
+    @cached_property
+    def conditions(self) -> Conditions | None:
+        """The linear conditions of a set that does not move and is no box, or None."""
+        problem, args = self.problem, self.args
+        set_at = lambda t: jtu.tree_leaves(problem.set_at(t, args))  # noqa: E731
+        K = problem.set_at(jnp.zeros(()), args)
+        if not is_of_library(K) or not independent(set_at, jnp.zeros(())):
+            return None
+        return conditions(K, self.u0)
 
     @cached_property
     def _intervals(self) -> SlopeEnclosure | None:

@@ -7,6 +7,7 @@ large: where the law passes a kink, and its derivative is unknown while it may b
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -18,11 +19,12 @@ from ..evolution import ETD2RK, RESULTS, Solution, solve
 from ..evolution.results import is_success
 from ..problem import Problem
 from ..programs.slope import Values, interval
-from .certificate import Bound, bound_by_constants, continue_bound, disturbances
+from .certificate import Bound, bound_by_constants, continue_bound, disturbances, encloses_by
 from .constants import Constants
 from .error_ellipsoid import ErrorEllipsoid, Propagated, propagate
+from .faces import Range
 from .linearisation import MAX_UNKNOWNS, Linearisation, linearisation
-from .local_derivatives import LocalDerivatives, Range, of_region
+from .local_derivatives import LocalDerivatives, of_region
 from .modulus_status import modulus_statuses
 from .projection_speed import slopes
 from .region import Region
@@ -223,6 +225,9 @@ class Tube:
                 constants = self.constants(a, b, *box, near)
             if isinstance(constants, str):
                 return constants
+            if not encloses_by(sol, constants):
+                self._weaken(constants)
+                sol = self._solve(a, nodes, saved, before)
             ball = ErrorEllipsoid.ball(error, self.size)
             start = ball if before is None or before.ellipsoid is None else before.ellipsoid
             along = self._propagated(sol, constants, start, reach, saved, before)
@@ -237,6 +242,17 @@ class Tube:
             self.width *= 4.0
         self.width = 1.0
         return why
+
+    def _weaken(self, constants: Constants) -> None:
+        """Enclose responses by moduli that these constants prove, with some room."""
+        first = self.first
+        moduli = (
+            0.8 * min(float(constants.gamma), float(first.gamma)),
+            1.25 * max(float(constants.L_F), float(first.L_F)),
+            max(float(constants.norm_P_inv), float(first.norm_P_inv)),
+        )
+        where = lambda c: (c.gamma, c.L_F, c.norm_P_inv)  # noqa: E731
+        self.first = eqx.tree_at(where, first, moduli)
 
     def _solve(
         self, a: float, nodes: np.ndarray, saved: np.ndarray, before: Piece | None
