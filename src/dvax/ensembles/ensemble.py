@@ -111,9 +111,10 @@ def ensemble(
     options: dict[str, Any] = dict(
         dt=dt, rtol=rtol, atol=atol, method=method, vi_solver=vi_solver, constants=constants,
         measure=measure, dt0=dt0, dt_max=dt_max, horizon=horizon, max_steps=max_steps,
-        adjoint=adjoint, events=events, max_events=max_events,
+        adjoint=adjoint, max_events=max_events,
     )  # fmt: skip
     check_events(events, max_events, method, dt, False)
+    options["events"] = tuple(map(current, events))
     check_own(method, observe, folds, keep, lanes, axes)
     problem = current(problem)
     states, times = _tree.as_float(x0s, "x0s"), (_times(t0), _times(t1))
@@ -145,7 +146,7 @@ def ensemble(
     }
 
     def program(choice: Choice, watch: bool = False) -> Program:
-        code = problem, choice.method, vi_solver or Auto(), tuple(events), constants
+        code = problem, choice.method, vi_solver or Auto(), options["events"], constants
         steps = {"stiff_steps": choice.least if watch else math.inf}
         return Program.of(code, inputs, numbers | steps, static._replace(watch_stiffness=watch))
 

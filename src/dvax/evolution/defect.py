@@ -28,7 +28,7 @@ from ..programs.enclosure import LinearEnclosure, is_enclosure
 from ..spaces import AbstractSpace
 from .bounds import Bounds
 from .evaluations import Evaluation
-from .excursions import TRUSTED_STEP_SHARE
+from .excursions import trusted_length
 from .flow import Flow, Rate
 from .method import AbstractMethod, combined, extrapolation, polynomial
 
@@ -86,7 +86,7 @@ def enclosed(
     the law."""
     ends, arc, growth, span = lax.stop_gradient((ends, arc, growth, span))
     h, x0, x1, c = values(tuple(arc))
-    short = h <= TRUSTED_STEP_SHARE * span
+    short = h <= trusted_length(span)
     space = flow.state_space(x0)
     bend = flow.generator.chord_deviation(arc, space, growth)
     x = jtu.tree_map(LinearEnclosure, x0, x1, bend)

@@ -59,8 +59,8 @@ def checked_events(setup: Setup, args: Any) -> tuple[Event, ...]:
 def _checked(event: Event, inputs: dict[str, Any]) -> Event:
     x = inputs["x"]
     value = _shapes("function", event.function, inputs)
-    if jnp.shape(value) != ():
-        given = f"shape {jnp.shape(value)}"
+    if value is None or isinstance(value, tuple | list) or jnp.shape(value) != ():
+        given = "None" if value is None else f"shapes {_tree.shapes(value)}"
         fix = "Return one number, and write one dvax.Event for each"
         raise input_error(f"{_CALLER}(function)", given, "it must be one number", fix)
     reset = event.reset

@@ -32,14 +32,19 @@ from .results import RESULTS
 from .stepper import Stepper, dense_output, one_sided_time
 from .time_derivatives import midpoint, velocity
 
-_WINDOW = 1e-6
-"""Largest distance of an event from the end of the step that ends behind it, in lengths of the step."""
+_WINDOW, _SMALLEST_WINDOW = 1e-6, 1e-12
+"""Largest and smallest distance of an event from the end of the step that ends behind it, in lengths of
+the step. Behind a reset g must differ from zero by more than its rounding. Everything else wants it
+small: the flow over it, in which A may be stiff, and the order of events."""
 
-_BRACKET = 1e-10
+_BRACKET = 1e-13
 """Length of the interval in which an event is located, in lengths of the step."""
 
 _MIN_ULPS, _BRACKET_ULPS = 16, 4
-"""The smallest values of both, in roundings of t."""
+"""The smallest values of these, in roundings of t."""
+
+_LEFT = 1e-3
+"""Distance from an event, in widths, at which g is taken to have its slope before the event."""
 
 _TOUCH = 2.0
 """An extremum of g counts as zero within this many tolerances."""
@@ -135,9 +140,11 @@ class EventWatch(eqx.Module):
     def _rounding(sizes: jax.Array) -> jax.Array:
         return _ROUNDINGS * jnp.finfo(sizes.dtype).eps * sizes
 
-    def values(self, flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
-        """Return the values of all functions."""
-        u = _response(flow, t, x, guess)
+    def values(
+        self, flow: Flow, t: Any, x: Tree, guess: Tree | None, inset: Any = 0.0
+    ) -> jax.Array:
+        """Return the values of all functions at t, with the response at t − `inset`."""
+        u = _response(flow, t - inset, x, guess)
         dtype = jnp.result_type(*jtu.tree_leaves(x))
         return jnp.stack(
             [jnp.asarray(e.function(t, x, u, flow.args), dtype).reshape(()) for e in self.events]
@@ -209,15 +216,14 @@ class EventWatch(eqx.Module):
     ) -> Observation:
         """Watch the accepted step number `number`, to `end` and x1, if the lane is `active`."""
         search: Any = partial(EventWatch._search, active=active)
-        walk, fired, widths, table, count = search(
+        walk, fired, widths, window, table, count = search(
             *jtu.tree_map(_constant, (self, stepper, watched, step, end, guess))
         )
         h, before, rows = end - step.start, watched.count, watched.rows
-        width = lax.stop_gradient(_width(step.start, end))
         time = lax.stop_gradient(step.start + walk.b * h)
         stops = jnp.any(fired & self._stops)
-        at_end = stops & (end - time <= width)
-        event, margin = jnp.where(stops & ~at_end, time, jnp.inf), 0.5 * width
+        at_end = stops & (end - time <= window)
+        event, margin = jnp.where(stops & ~at_end, time, jnp.inf), 0.5 * window
         numbers = jnp.arange(self.max_events)
         new = (numbers >= before) & (numbers < count)
         rows = Rows(
@@ -270,7 +276,7 @@ class EventWatch(eqx.Module):
             return Observation(inside, event, margin, jnp.asarray(False), x1, result)
 
         seen = lax.cond(any_lane(at_end), stop, go_on)
-        finite = jnp.all(jnp.isfinite(walk.vb)) | ~active
+        finite = jnp.all(jnp.isfinite(walk.vb)) & (~seen.jumped | _tree.all_finite(seen.x)) | ~active
         return seen._replace(result=RESULTS.where(finite, seen.result, RESULTS.event_nonfinite))
 
     def _search(
@@ -281,17 +287,23 @@ class EventWatch(eqx.Module):
         end: Any,
         guess: Tree | None,
         active: Any,
-    ) -> tuple[Walk, jax.Array, jax.Array, Rows, Any]:
+    ) -> tuple[Walk, jax.Array, jax.Array, Any, Rows, Any]:
         """Walk along a step to its end, or to the first event at which it must end. Return the walk,
-        which events happen where it stops, their widths, a table with the times, indices and widths of
-        the others, and the number of its rows."""
+        which events happen where it stops, their widths, the largest distance of an event from the end
+        of a step that ends there, a table with the times, indices and widths of the others, and the
+        number of its rows."""
         t0, h, *_ = step
         at_x = dense_output(stepper.method, stepper.flow, step, guess, stepper.ends, end)
         inset = end - one_sided_time(t0, end, 1.0, stepper.ends)
+        # No step follows the last one, which has the events at t1.
+        is_last = end >= stepper.ends[1]
 
         def values(theta: Any) -> jax.Array:
-            t = t0 + theta * h - jnp.where(theta >= 1.0, inset, 0.0)
-            return self.values(stepper.flow, t, at_x(theta), guess)
+            at_end = theta >= 1.0
+            before = jnp.where(at_end, inset, 0.0)
+            t = jnp.where(at_end & is_last, end, t0 + theta * h - before)
+            inside = jnp.where(is_last, before, 0.0)
+            return self.values(stepper.flow, t, at_x(theta), guess, inside)
 
         def at(theta: Any) -> tuple[jax.Array, jax.Array]:
             return jax.jvp(values, (theta,), (jnp.ones_like(theta),))
@@ -302,19 +314,21 @@ class EventWatch(eqx.Module):
         limits = self._directions, touch, self._noise(watched.sizes), shortest
         width, rounding = _width(t0, end), self._rounding(watched.sizes)
 
-        def happens(walk: Walk) -> tuple[jax.Array, jax.Array]:
+        def happens(walk: Walk) -> tuple[jax.Array, jax.Array, Any]:
             arrived = arrives(walk.va, walk.vb, self._directions)
             near = touches(walk.va, walk.da, walk.vb, walk.db, walk.b - walk.a, *limits[:2])
             fired = walk.found & walk.above & (arrived | near)
             # In a short step, as from a kink to the next, g is rounded by more than it changes in it.
             slope = jnp.minimum(jnp.abs(walk.da), jnp.abs(walk.db)) / h
             rounded = rounding / jnp.where(slope == 0, jnp.inf, slope)
-            return fired, jnp.where(near & ~arrived, 0.0, width + rounded)
+            closest = jnp.max(jnp.where(fired & self._stops, rounded, 0.0))
+            window = jnp.clip(closest, _width(t0, end, _SMALLEST_WINDOW), width)
+            return fired, jnp.where(near & ~arrived, 0.0, width + rounded), window
 
         def one(carry: tuple[Walk, Rows, Any]) -> tuple[Walk, Rows, Any]:
             walk, table, count = carry
             walk = next_event(walk, at, *limits)
-            fired, widths = happens(walk)
+            fired, widths, _ = happens(walk)
             onward = walk.found & ~jnp.any(fired & self._stops)
             row = Rows(t0 + walk.b * h, -1, None, None, widths, None)
             table, count = self._put(table, fired & onward, count, row)
@@ -397,23 +411,34 @@ class EventWatch(eqx.Module):
         if reset is None:
             return before, before
         u = _response(flow, t + s, before, guess)
-        return before, reset(t + s, before, u, flow.args)
+        after = reset(t + s, before, u, flow.args)
+        # A reset may return whole numbers.
+        return before, jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), after, before)
 
     def _shift(
         self, flow: Flow, t: Any, x: Tree, k: Any, fired: Any, width: Any, guess: Tree | None
     ) -> Any:
-        """Return s with g(t + s, Φ_s(x)) = 0 for event k: two steps of Newton's method from 0.
+        """Return s with g(t + s, Φ_s(x)) = 0 for event k: two steps of Newton's method from 0, or from
+        the left of the event if g is constant behind it, as where the law saturates.
 
         At an extremum that touches zero, and where g jumps, s is 0 and its derivatives are NaN.
         """
 
-        def newton(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
-            values, slopes = self.along_flow(flow, t, x, guess, carry[0])
-            slope = slopes[k]
-            return carry[0] - values[k] / jnp.where(slope == 0, 1.0, slope), slope != 0
+        reach = jnp.where(jnp.isfinite(width), width, 0.0)
+
+        def newton(k_step: Any, carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+            s, flat, _ = carry
+            values, slopes = self.along_flow(flow, t, x, guess, s)
+            slope, first = slopes[k], k_step == 0
+            flat = jnp.where(first, slope == 0, flat)
+            zero = s - values[k] / jnp.where(slope == 0, 1.0, slope)
+            # At the zero g has two slopes. The last step starts left of it.
+            from_left = jnp.where(first, -reach, jnp.where(k_step == 1, zero - _LEFT * reach, zero))
+            return jnp.where(flat, from_left, zero), flat, slope != 0
 
         # The derivatives of two steps from the zero are those of the zero, up to the second.
-        s, exists = lax.fori_loop(0, 2, newton, (jnp.zeros_like(t), jnp.asarray(True)))
+        start = jnp.zeros_like(t), jnp.asarray(False), jnp.asarray(True)
+        s, _, exists = lax.fori_loop(0, 3, newton, start)
         exists &= jnp.abs(s) <= 2.0 * width
         s = jnp.where(fired & exists, s, 0.0)
         (s,) = nan_derivatives_if_used(fired & ~exists, [s], (flow, t, x))
@@ -480,8 +505,8 @@ def _ulp(t: Any) -> Any:
     return jnp.finfo(t.dtype).eps * jnp.abs(t)
 
 
-def _width(t0: Any, t1: Any) -> Any:
-    """Return the largest distance of an event from the end of a step that ends behind it."""
+def _width(t0: Any, t1: Any, window: float = _WINDOW) -> Any:
+    """Return a distance of an event from the end of a step that ends behind it."""
     ulp = jnp.maximum(_ulp(t0), _ulp(t1))
     eps = jnp.finfo(t0.dtype).eps
-    return jnp.maximum(jnp.maximum(_WINDOW, _MIN_ULPS * eps) * (t1 - t0), _MIN_ULPS * ulp)
+    return jnp.maximum(jnp.maximum(window, _MIN_ULPS * eps) * (t1 - t0), _MIN_ULPS * ulp)

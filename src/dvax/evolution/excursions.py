@@ -43,8 +43,10 @@ from ..vi import independent
 from .evaluations import Evaluation
 from .flow import Flow, slope
 
-TRUSTED_STEP_SHARE = 1e-6
-"""Length of the steps, as a share of the run, up to which samples are trusted without enclosures."""
+_TRUSTED_SHARE, _TRUSTED_ROUNDINGS = 1e-6, 256.0
+"""Length of the steps, as a share of the run, up to which samples are trusted without enclosures, and
+its smallest value in roundings of the length of the run: in shorter steps rounding is all that data
+do."""
 
 _IGNORED_SHARE = 0.1
 """Depth of an excursion that is ignored, as a share of the tolerance."""
@@ -58,6 +60,11 @@ _VARIATION_SHARE = 0.25
 _HALVINGS = 64.0
 """Number of times that a run halves V. At the crest of a wave as long as the run, V is still a tenth of
 the variation before it."""
+
+
+def trusted_length(span: Any) -> Any:
+    """Return the length of the steps of a run up to which samples are trusted without enclosures."""
+    return max(_TRUSTED_SHARE, _TRUSTED_ROUNDINGS * float(jnp.finfo(span.dtype).eps)) * span
 
 
 class ExcursionEstimate(NamedTuple):

@@ -28,7 +28,7 @@ class RESULTS(eqx.Enumeration):
 
     successful = "The end time was reached."
     terminal_event = "A terminal event ended the run."
-    event_nonfinite = "The function of an event returned NaN or infinity."
+    event_nonfinite = "The function or the reset of an event returned NaN or infinity."
     max_events = "More than max_events events happened, or they accumulate at one time."
     max_steps = "The largest number of steps was reached before t1."
     step_too_small = (

@@ -162,9 +162,10 @@ def solve(
         check_save(save, ts, x0, args, others)
     check_events(events, max_events, method, dt, certified_tol is not None)
     problem, x0 = current(problem), _state(problem, x0)
+    own = tuple(map(current, events))
     call = Arguments(
         problem, x0, t0, t1, args, ts, dt, rtol, atol, method, vi_solver, progress, constants,
-        certified_tol, measure, dense, dt0, dt_max, horizon, max_steps, adjoint, throw, events,
+        certified_tol, measure, dense, dt0, dt_max, horizon, max_steps, adjoint, throw, own,
         max_events, save,
     )  # fmt: skip
     if certified_tol is not None:
@@ -339,7 +340,8 @@ def _examined(setup: Setup, times: Any, options: Options, solution: Solution) ->
 
 def prepared(call: Arguments) -> tuple[Setup, Any, Options]:
     """Return what `solve` compiles for these arguments: the setup, the saved times and the options."""
-    call = call._replace(problem=current(call.problem), x0=_state(call.problem, call.x0))
+    problem, x0 = current(call.problem), _state(call.problem, call.x0)
+    call = call._replace(problem=problem, x0=x0, events=tuple(map(current, call.events)))
     check(call)
     call, choice = _chosen(call)
     setup, options = arranged(call, choice.method)

@@ -74,10 +74,12 @@ class BoundAlong:
         initial_error: float = 0.0, max_steps: int | None = None,
     ):  # fmt: skip
         self.problem = problem = current(problem)
-        self.t = float(sol.setup.setting["t0"])
+        self.dtype = sol.ts.dtype
+        self.t = self._rounded(float(sol.setup.setting["t0"]))
         # In the precision of the solution, to which a saved time is one of these.
-        self.times = np.unique(times.astype(sol.ts.dtype)).astype(float)
-        self.end, self.initial_error = max(end, float(self.times[-1])), initial_error
+        self.times = np.unique(times.astype(self.dtype)).astype(float)
+        self.end = max(self._rounded(end), float(self.times[-1]))
+        self.initial_error = initial_error
         self.rows: dict[float, _Row] = {}
         self.span = self.end - self.t
         self.tube = Tube(problem, sol, self.t, self.end)
@@ -85,6 +87,10 @@ class BoundAlong:
         self.before: Piece | None = None
         self.unknown = 0  # pieces in a row with an unknown derivative of the law
         self.steps, self.max_steps = 0, max_steps
+
+    def _rounded(self, t: float) -> float:
+        """Return a time in the precision of the solution: x_c is computed in it."""
+        return float(np.asarray(t, self.dtype))
 
     def bound(self, sol: Solution) -> Bound:
         """Return the bound of the next part."""
@@ -105,7 +111,10 @@ class BoundAlong:
         b = min(self.t + self.length, self.end)
         b = self.end if self.end - b < 1e-3 * self.length else b
         # More saved times than a piece has room for end it.
-        b = min(b, left[MAX_SAVED - 1]) if len(left) > MAX_SAVED else b
+        b = self._rounded(min(b, left[MAX_SAVED - 1]) if len(left) > MAX_SAVED else b)
+        if b <= self.t:
+            self.why = f"a piece would have to be shorter than the rounding of t = {self.t:.6g}"
+            return
         saved = left[: np.searchsorted(left, b, side="right")]
         piece = self._next(b, saved)
         if piece is not None:

@@ -380,7 +380,7 @@ def check_bounded(problem: Problem, sol: Any, initial_error: Any) -> None:
             "a solution of events with a reset",
             "the computed and the exact trajectory are reset at different times, and in between "
             "their distance is that of the reset, which no constant of the problem bounds",
-            "Bound the pieces between the events, solved one by one with initial_error=",
+            "Bound the run up to its first event: terminal=True. What follows has no bound",
         )
     if not isinstance(initial_error, Bound) and _tree.is_concrete(initial_error):
         number = np.asarray(initial_error)

@@ -116,18 +116,20 @@ def iterate(
         initial_step = jnp.where(s.count == 0, trial.step, s.initial_step)
         # w contains (base − y)/λ, and so the rounding error of y divided by λ. If that is comparable
         # with ‖F(y)‖, then y − λF(y) rounds to y and w = 0 is meaningless. The exception is an F(y)
-        # below the tolerance, for which y is a solution since 0 ∈ N_K(y).
+        # that counts as zero, for which y is a solution since 0 ∈ N_K(y).
         rounding, norm_F = eps * norm(trial.y), norm(trial.value)
         F_is_large = (norm_F > target + 4 * rounding / initial_step) | (lam < 1e3 * eps) & (
             norm_F > target
         )
+        limit = residual_limit(frozen, target, trial.y, norm_F, lam, initial_step)
         meaningless = (rounding / lam > 0.1 * norm_F) & F_is_large & (vi.L_F is None)
+        meaningless &= norm_F > limit
         accepted = ~jnp.asarray(trial.rejected)
         finite = (jnp.isfinite(residual) & jnp.isfinite(size)) | ~accepted
         residual = jnp.where(meaningless, jnp.inf, residual)
         # The first point replaces the start in any case, since the start may lie outside of K.
         better = (residual < s.residual) | (s.count == 0)
-        done = residual <= residual_limit(frozen, target, trial.y, norm_F, lam, initial_step)
+        done = residual <= limit
         # The iterates changed by rounding alone, since the last iteration (stalled) or since the
         # checkpoint (cycling). Brent's algorithm renews the checkpoint at every power of two, so it
         # finds cycles of any length.

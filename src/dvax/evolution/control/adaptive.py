@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..._tree import Tree
-from ..excursions import TRUSTED_STEP_SHARE
+from ..excursions import trusted_length
 from ..results import RESULTS
 from ..stepper import Step
 from .controller import AbstractController, StepDecision, clip_to_stop, slack
@@ -101,7 +101,7 @@ class Adaptive(AbstractController):
         is_noise = state.guard.is_noise(attempt.modulus, self.defect_order)
         is_roundoff = lax.stop_gradient(is_noise & (attempt.error <= attempt.roundoff))
         covered = state.budget.covers(attempt, is_noise) | is_roundoff
-        is_resolved = 4.0 * attempt.smallest <= TRUSTED_STEP_SHARE * span
+        is_resolved = 4.0 * attempt.smallest <= trusted_length(span)
         crossing = state.budget.may_cross(attempt, is_resolved, step.unenclosed)
         excursion = self._excursion(x0, step, attempt, span)
         passes = (attempt.error <= 1.0) | covered | crossing
@@ -197,7 +197,7 @@ class Adaptive(AbstractController):
         """Return by how much data may have moved unseen between the samples, 1 being the limit."""
         if step.excursion is None:
             return jnp.zeros_like(attempt.size)
-        watched = attempt.size > TRUSTED_STEP_SHARE * span
+        watched = attempt.size > trusted_length(span)
         return lax.stop_gradient(jnp.where(watched, self.test.excursion(x0, step), 0.0))
 
     def _event(self, step: Step, attempt: Attempt, is_too_long: Any) -> Any:
