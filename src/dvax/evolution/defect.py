@@ -27,6 +27,7 @@ from ..programs.branches import branches
 from ..programs.enclosure import LinearEnclosure, is_enclosure
 from ..spaces import AbstractSpace
 from .bounds import Bounds
+from .enclosed_projection import widened
 from .evaluations import Evaluation
 from .excursions import trusted_length
 from .flow import Flow, Rate
@@ -109,11 +110,7 @@ def enclosed(
     if flow.interpolated:
         # Any part of f̃ may have the effect.
         error = jtu.tree_map(lambda e: e + effect / jnp.sqrt(space.size()), error)
-        control = flow.problem.spaces(x0)[1]
-        u = jtu.tree_map(
-            lambda q, w: q._replace(dev=q.dev + apart / jnp.sqrt(w)), u, control.weights(),
-            is_leaf=is_enclosure,
-        )  # fmt: skip
+        u = widened(u, apart, flow.problem.spaces(x0)[1])
     bounds = Bounds.of_enclosures(x, u)
     return Sample((), [rates[1]], error, defect, h * law_residual, bounds)
 

@@ -276,7 +276,9 @@ class EventWatch(eqx.Module):
             return Observation(inside, event, margin, jnp.asarray(False), x1, result)
 
         seen = lax.cond(any_lane(at_end), stop, go_on)
-        finite = jnp.all(jnp.isfinite(walk.vb)) & (~seen.jumped | _tree.all_finite(seen.x)) | ~active
+        finite = (
+            jnp.all(jnp.isfinite(walk.vb)) & (~seen.jumped | _tree.all_finite(seen.x)) | ~active
+        )
         return seen._replace(result=RESULTS.where(finite, seen.result, RESULTS.event_nonfinite))
 
     def _search(

@@ -30,7 +30,8 @@ from ..sets._library import is_of_library
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
 from ..vi.known import Known
-from .interpolated_response import Place, interpolated
+from .enclosed_projection import by_its_rules, part, widened
+from .interpolated_response import Place, interpolated, interpolated_projection
 from .law_tolerance import LawTolerance
 from .linearised import AbstractLinear, finite, linearise
 from .small_box import AbstractSmallBox
@@ -227,39 +228,50 @@ class Flow(eqx.Module):
         **Raises:** `NoEnclosure` where f, h or K uses an operation without a rule.
         """
         problem, args = self.problem, self.args
-        if not self.interpolated:
-            u = self._enclosed_response(t, x)
+        f = lambda t, x, u: problem.f(t, x, u, args)  # noqa: E731
+        if self.direct and self.small_box is None:
+            u = self._enclosed_response(t, x, first, last)
             zero = jnp.zeros_like(t.dev)
-            value = enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, u)
-            return EnclosedRate(value, u, zero, zero, zero)
-        assert first is not None and last is not None
+            return EnclosedRate(enclose(f, t, x, u), u, zero, zero, zero)
         places = self._place(t.a, x, first), self._place(t.b, x, last)
         line = interpolated(problem, args, self.operator, t, x, places, self.gamma, self.L_F)
-        value = enclose(lambda t, x, u: problem.f(t, x, u, args), t, x, line.u)
-        apart, effect = self.norm_P_inv * line.apart, self.tol.gain * line.apart
-        return EnclosedRate(value, line.u, line.residual, apart, effect)
+        apart = line.residual / self.gamma
+        effects = self.norm_P_inv * apart, self.tol.gain * apart
+        return EnclosedRate(enclose(f, t, x, line.u), line.u, line.residual, *effects)
 
-    def _place(self, t: Any, x: Tree, rate: Rate) -> Place:
-        start = jtu.tree_map(lambda line: line.a, x, is_leaf=is_enclosure)
+    def _place(self, t: Any, x: Tree, rate: Rate | None) -> Place:
+        assert rate is not None
         y = rate.nearest
-        if y is None:
-            y = self.set_at(t).project(rate.z, self.problem.spaces(start)[1])
+        if y is None and self.direct and self.small_box is None:
+            y = rate.y
+        elif y is None:
+            y = self.set_at(t).project(rate.z, self.problem.spaces(part(x, "a"))[1])
         return jax.lax.stop_gradient(Place(rate.z, y, rate.switches))
 
-    def _enclosed_response(self, t: LinearEnclosure, x: Tree) -> Tree:
-        """Return the enclosure of the response of a law in closed form, on pointwise intervals."""
-        problem, args, P = self.problem, self.args, self.operator
-        start = jtu.tree_map(lambda line: line.a, x, is_leaf=is_enclosure)
-        zero = problem.zero_control(start)
-        drive = enclose(lambda t, x: problem.h(t, x, zero, args), t, x)
+    def _enclosed_response(
+        self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
+    ) -> Tree:
+        """Return the enclosure of the response of a law in closed form."""
+        problem, args = self.problem, self.args
+        start = part(x, "a")
+        zero, space = problem.zero_control(start), problem.spaces(start)[1]
         if self.reciprocal is None:
             raise NoEnclosure("a slope of the law that moves")
+        drive = enclose(lambda t, x: problem.h(t, x, zero, args), t, x)
         z = enclose(lambda d: jtu.tree_map(jnp.multiply, d, self.reciprocal), drive)
-        ends = enclose(lambda t: problem.set_at(t, args).intervals(zero), t)
-        y = jtu.tree_map(
-            lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
-        )
-        return enclose(P.inverse, y)
+        K = problem.set_at(t.a, args)
+        if K.intervals(zero) is not None:
+            ends = enclose(lambda t: problem.set_at(t, args).intervals(zero), t)
+            y = jtu.tree_map(
+                lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
+            )
+        elif self.interpolated:
+            places = self._place(t.a, x, first), self._place(t.b, x, last)
+            y, apart = interpolated_projection(space, z, places)
+            y = widened(y, apart, space)
+        else:
+            y = by_its_rules(K, space, z)
+        return enclose(self.operator.inverse, y)
 
     def switches_of(self, t: Any, x: Tree, rate: Rate) -> list[jax.Array] | None:
         """`switch_parts` at (t, x), whose rate this is."""
@@ -325,7 +337,7 @@ def _by_loop(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     rate = flow._closed_form(t, x) if flow.direct else _solved(flow, t, x, guess)
     switches = flow.switch_parts(t, x, rate.z) if flow.keeps_switches else None
     nearest = None
-    if flow.interpolated:
+    if flow.interpolated and not flow.direct:
         nearest = flow.set_at(t).project(rate.z, flow.problem.spaces(x)[1])
     return rate._replace(**jax.lax.stop_gradient({"switches": switches, "nearest": nearest}))
 

@@ -1,25 +1,21 @@
 """How far the response over a step is from a line between its values at both ends.
 
-At the ends k = 0, 1 of a step let yₖ = proj_K(zₖ) and vₖ = σₖ(zₖ − yₖ) with σₖ ≥ 0, so that
-vₖ ∈ N_K(yₖ). Let y, v and u = P⁻¹y be lines between their values at the ends. For every k ∈ K
+Let F(y) = P⁻¹y − h(t, x, P⁻¹y), and let y* solve the law at the t and x of a time θ in the step. Let y
+be the line between its values at the ends, and u = P⁻¹y. Since F is strongly pseudomonotone,
+⟨F(y*), y − y*⟩ ≥ 0 implies γ‖y − y*‖² ≤ ⟨F(y), y − y*⟩. The law's solver is not enclosed.
 
-    ⟨v(θ), k − y(θ)⟩ ≤ θ(1 − θ)g ≤ g/4,   g = ⟨v₁ − v₀, y₁ − y₀⟩ ≥ 0.
+*Polyhedral sets.* With normals v at the ends, an enclosure of h along u proves ‖F(y(θ)) + v(θ)‖ ≤ r for
+the line v, and with g of `enclosed_projection`
 
-For a polyhedral K with the same active constraints at both ends, g = 0. If K is a box whose bounds are
-the lines l and b, then with s⁺ = max(s, 0) and s⁻ = max(−s, 0)
+    γ‖y − y*‖² ≤ r‖y − y*‖ + g/4,   so that γ‖y − y*‖ ≤ ρ = ½(r + √(r² + γg)).
 
-    g = ⟨v₀⁺, b₁ − y₁⟩ + ⟨v₁⁺, b₀ − y₀⟩ + ⟨v₀⁻, y₁ − l₁⟩ + ⟨v₁⁻, y₀ − l₀⟩.
-
-Let F(y) = P⁻¹y − h(t, x, P⁻¹y). An enclosure of h along u proves ‖F(y(θ)) + v(θ)‖ ≤ r. Let y* solve the
-law at the same t and x. F is strongly pseudomonotone: ⟨F(y*), y − y*⟩ ≥ 0 implies
-
-    γ‖y − y*‖² ≤ ⟨F(y), y − y*⟩ ≤ r‖y − y*‖ + g/4,   so that γ‖y − y*‖ ≤ ρ = ½(r + √(r² + γg)).
-
-If the bounds of the box are lines up to d, each yᵢ moves by at most dᵢ with the bound to which vᵢ is
+If the bounds of a box are lines up to d, each yᵢ moves by at most dᵢ with the bound to which vᵢ is
 normal: g stays the same, and F changes by at most L_F‖d‖.
 
-For smooth data r = O(h²), and g = O(h²) in a step in which active constraints change. The solver of
-the law is neither differentiated nor enclosed.
+*Other sets.* The natural residual R = y − proj_K(y − F(y)/L_F) is enclosed, and
+γ‖y − y*‖ ≤ ρ = (γ + 2L_F)‖R‖ (`docs/theory/proofs.md`, C1).
+
+For smooth data ρ = O(h²), and ρ = O(h) in a step in which active constraints change.
 """
 
 from typing import Any, NamedTuple
@@ -33,19 +29,13 @@ from .._tree import Tree
 from ..operators import AbstractOperator
 from ..problem import Problem
 from ..programs.enclosure import LinearEnclosure, enclose, is_enclosure, straight
-from ..sets import AbstractSet, Ball, Ellipsoid, Intersection, SecondOrderCone
-from ..sets._library import is_of_library, sets_in
 from ..spaces import AbstractSpace
-
-_CURVED = (Ball, Ellipsoid, SecondOrderCone)
-
-_ROUNDINGS = 1e4
-"""Error of a projection that is no box, in units of ε times the size of z and y."""
+from .enclosed_projection import by_its_rules, gap, gap_of_box, is_polyhedral, part, rounding_of
 
 
 class Place(NamedTuple):
-    """An end of a step: z, its projection y onto K, and the switch functions of K at z where K is no
-    box."""
+    """An end of a step: z, its projection y onto K, and the switch functions of K at z where they are
+    known."""
 
     z: Tree
     y: Tree
@@ -56,19 +46,10 @@ class InterpolatedResponse(NamedTuple):
     """The line between the responses at both ends of a step.
 
     - `u`: the line, as enclosures without a deviation;
-    - `residual`: ρ of the file's docstring, at all times of the step;
-    - `apart`: a bound on ‖y − y*‖, which is ρ/γ unless bounds move."""
+    - `residual`: ρ of the file's docstring, at all times of the step; ‖y − y*‖ ≤ ρ/γ."""
 
     u: Tree
     residual: jax.Array
-    apart: jax.Array
-
-
-def is_polyhedral(K: AbstractSet, like: Tree) -> bool:
-    """Return whether K is known to be a box, or a polyhedral set with an exact projection."""
-    if K.intervals(like) is not None:
-        return True
-    return is_of_library(K) and not any(isinstance(s, (*_CURVED, Intersection)) for s in sets_in(K))
 
 
 def interpolated(
@@ -77,34 +58,64 @@ def interpolated(
 ) -> InterpolatedResponse:  # fmt: skip
     """Return the line between the responses at two places, for enclosures of t and x.
 
-    **Raises:** `NoEnclosure` where h, or the bounds of a box, use an operation without a rule.
+    **Raises:** `NoEnclosure` where h, the bounds of a box, or the projection onto a set that is not
+    polyhedral use an operation without a rule.
     """
-    start = jtu.tree_map(lambda q: q.a, x, is_leaf=is_enclosure)
+    start = part(x, "a")
     space, like = problem.spaces(start)[1], problem.zero_control(start)
-    lines, moved = None, jnp.zeros((), _tree.dtype(like))
-    if problem.set_at(t.a, args).intervals(like) is not None:
-        lines = enclose(lambda t: problem.set_at(t, args).intervals(like), t)
-        places = _clipped(places[0], lines, "a"), _clipped(places[1], lines, "b")
-        moved = space.norm(_full(jtu.tree_map(_larger, *lines, is_leaf=is_enclosure), like))
-    u = straight(*(P.inverse(place.y) for place in places))
-    h = enclose(lambda t, x, u: problem.h(t, x, u, args), t, x, u)
-    F = [_tree.sub(_part(u, end), _part(h, end)) for end in ("a", "b")]
-    normals = [_normal(space, *pair) for pair in zip(F, places, strict=True)]
-    sums = [space.norm(_tree.add(value, v)) for value, (v, _) in zip(F, normals, strict=True)]
-    stretch = jnp.maximum(*(sigma for _, sigma in normals))
-    v = tuple(v for v, _ in normals)
-    if lines is not None:
-        g, rounding = _gap_of_box(space, places, v, lines), jnp.zeros_like(moved)
+    K = problem.set_at(t.a, args)
+    bounds, moved = None, jnp.zeros((), _tree.dtype(like))
+    if K.intervals(like) is not None:
+        bounds = enclose(lambda t: problem.set_at(t, args).intervals(like), t)
+        places = _clipped(places[0], bounds, "a"), _clipped(places[1], bounds, "b")
+        moved = space.norm(_full(jtu.tree_map(_larger, *bounds, is_leaf=is_enclosure), like))
+    y = places[0].y, places[1].y
+    u = straight(*map(P.inverse, y))
+    law = lambda t, x, u: _tree.sub(u, problem.h(t, x, u, args))  # noqa: E731
+    if bounds is None and not is_polyhedral(K):
+        of_F = enclose(lambda t, x, u, y: _step(y, law(t, x, u), L_F), t, x, u, straight(*y))
+        R = enclose(_tree.sub, straight(*y), by_its_rules(K, space, of_F))
+        largest = space.norm(jtu.tree_map(lambda q: q.largest, R, is_leaf=is_enclosure))
+        return InterpolatedResponse(u, (gamma + 2.0 * L_F) * largest)
+    F = enclose(law, t, x, u)
+    normals = [
+        _normal(space, value, place)
+        for value, place in zip((part(F, "a"), part(F, "b")), places, strict=True)
+    ]
+    v, stretch = (normals[0][0], normals[1][0]), jnp.maximum(normals[0][1], normals[1][1])
+    if bounds is None:
+        rounding = rounding_of(space, *(place[:2] for place in places))
+        switches = places[0].switches, places[1].switches
+        g = gap(space, y, v, switches, stretch, rounding)
     else:
-        rounding = _rounding(space, places)
-        g = _gap(space, places, v, stretch, rounding)
-    r = jnp.maximum(*sums) + space.norm(_part(h, "dev")) + L_F * moved + (L_F + stretch) * rounding
-    rho = 0.5 * (r + jnp.sqrt(jnp.square(r) + gamma * g)) + gamma * (moved + rounding)
-    return InterpolatedResponse(u, rho, rho / gamma)
+        g, rounding = gap_of_box(space, y, v, bounds), jnp.zeros_like(moved)
+    ends = [space.norm(_tree.add(part(F, end), w)) for end, w in zip(("a", "b"), v, strict=True)]
+    r = jnp.maximum(*ends) + space.norm(part(F, "dev")) + L_F * moved + (L_F + stretch) * rounding
+    rho = 0.5 * (r + jnp.sqrt(jnp.square(r) + gamma * g))
+    return InterpolatedResponse(u, rho + gamma * (moved + rounding))
 
 
-def _part(enclosures: Tree, name: str) -> Tree:
-    return jtu.tree_map(lambda q: getattr(q, name), enclosures, is_leaf=is_enclosure)
+def interpolated_projection(
+    space: AbstractSpace, z: Tree, places: tuple[Place, Place]
+) -> tuple[Tree, jax.Array]:
+    """Return the line between the projections at two places onto a polyhedral set, as enclosures, and
+    a bound on the distance of the projection from it, for an enclosure of z.
+
+    This is the law of F(y) = y − z."""
+    y = places[0].y, places[1].y
+    v = _tree.sub(places[0].z, y[0]), _tree.sub(places[1].z, y[1])
+    rounding = rounding_of(space, *(place[:2] for place in places))
+    g = gap(space, y, v, (places[0].switches, places[1].switches), 1.0, rounding)
+    ends = [
+        space.norm(_tree.sub(part(z, end), place.z))
+        for end, place in zip(("a", "b"), places, strict=True)
+    ]
+    r = jnp.maximum(*ends) + space.norm(part(z, "dev")) + 2.0 * rounding
+    return straight(*y), 0.5 * (r + jnp.sqrt(jnp.square(r) + g)) + rounding
+
+
+def _step(y: Tree, F: Tree, L_F: Any) -> Tree:
+    return jtu.tree_map(lambda a, b: a - b / L_F, y, F)
 
 
 def _larger(low: LinearEnclosure, up: LinearEnclosure) -> jax.Array:
@@ -120,9 +131,9 @@ def _full(tree: Tree, like: Tree) -> Tree:
     return jtu.tree_map(lambda v, w: jnp.broadcast_to(v, w.shape), tree, like)
 
 
-def _clipped(place: Place, lines: tuple[Tree, Tree], end: str) -> Place:
+def _clipped(place: Place, bounds: tuple[Tree, Tree], end: str) -> Place:
     """Return the place with the projection between the bounds of this end."""
-    return place._replace(y=jtu.tree_map(jnp.clip, place.z, *(_part(line, end) for line in lines)))
+    return place._replace(y=jtu.tree_map(jnp.clip, place.z, *(part(line, end) for line in bounds)))
 
 
 def _normal(space: AbstractSpace, F: Tree, place: Place) -> tuple[Tree, jax.Array]:
@@ -132,49 +143,3 @@ def _normal(space: AbstractSpace, F: Tree, place: Place) -> tuple[Tree, jax.Arra
     sigma = jnp.where(square > 0.0, jnp.maximum(-space.inner(F, s), 0.0) / square, 0.0)
     sigma = jnp.where(jnp.isfinite(sigma), sigma, 0.0)
     return _tree.scale(sigma, s), sigma
-
-
-def _gap_of_box(
-    space: AbstractSpace, places: tuple[Place, Place], v: tuple[Tree, Tree], lines: tuple[Tree, Tree]
-) -> jax.Array:  # fmt: skip
-    """Return g for a box whose bounds are lines."""
-
-    def of_leaf(
-        y0: jax.Array, y1: jax.Array, v0: jax.Array, v1: jax.Array, low: Any, up: Any
-    ) -> jax.Array:
-        return (
-            _product(v0, up.b - y1) + _product(v1, up.a - y0)
-            + _product(-v0, y1 - low.b) + _product(-v1, y0 - low.a)
-        )  # fmt: skip
-
-    first, last = places
-    terms = jtu.tree_map(of_leaf, first.y, last.y, *v, *lines)
-    return space.inner(terms, jtu.tree_map(jnp.ones_like, terms))
-
-
-def _product(v: jax.Array, slack: jax.Array) -> jax.Array:
-    """Return v⁺ times a slack, which may be infinite where v⁺ = 0."""
-    return jnp.where(v > 0.0, v * slack, 0.0)
-
-
-def _rounding(space: AbstractSpace, places: tuple[Place, Place]) -> jax.Array:
-    """Return a bound on the error of the projections."""
-    size = jnp.maximum(*(space.norm(place.z) + space.norm(place.y) for place in places))
-    return _ROUNDINGS * jnp.finfo(size.dtype).eps * size
-
-
-def _gap(
-    space: AbstractSpace, places: tuple[Place, Place], v: tuple[Tree, Tree], stretch: Any,
-    rounding: Any,
-) -> jax.Array:  # fmt: skip
-    """Return g for a set that does not move: 0 if no switch function changes its sign."""
-    first, last = places
-    of_y, of_v = _tree.sub(last.y, first.y), _tree.sub(v[1], v[0])
-    doubt = 2.0 * rounding * (space.norm(of_v) + stretch * (space.norm(of_y) + 2.0 * rounding))
-    g = jnp.maximum(space.inner(of_v, of_y), 0.0)
-    if first.switches is None or last.switches is None:
-        return g + doubt
-    same = g <= doubt
-    for a, b in zip(first.switches, last.switches, strict=True):
-        same &= jnp.all(((a > rounding) & (b > rounding)) | ((a < -rounding) & (b < -rounding)))
-    return jnp.where(same, 0.0, g + doubt)

@@ -8,11 +8,11 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._jax.jaxprs import has_loop
-from ..programs.enclosure import constant, enclose, has_enclosure
+from ..programs.enclosure import constant, has_enclosure
 from ..vi import AbstractSolver, Auto, analyse, independent
-from .flow import Flow, slope
+from .enclosed_projection import is_polyhedral
+from .flow import Flow, Rate, slope
 from .implicit import Implicit
-from .interpolated_response import is_polyhedral
 from .law_tolerance import law_tolerance
 from .linearised import NoJacobian
 from .method import AbstractMethod
@@ -52,10 +52,10 @@ class Plan(NamedTuple):
         plan = Plan._of_law(setup)
         if isinstance(setup.method, Implicit) or setup.method.degree > 1:
             return plan
-        if plan.closed_form and _is_enclosed(setup, plan):
-            return plan._replace(enclosed=True)
-        interpolated = _is_interpolated(setup)
-        return plan._replace(enclosed=interpolated, interpolated=interpolated)
+        at_ends = plan._replace(interpolated=True)
+        ways = [plan, at_ends] if plan.closed_form else [at_ends]
+        enclosed = next((way for way in ways if _is_enclosed(setup, way)), None)
+        return plan if enclosed is None else enclosed._replace(enclosed=True)
 
     @staticmethod
     def _of_law(setup: Setup) -> "Plan":
@@ -115,38 +115,25 @@ class Plan(NamedTuple):
 
 
 def _is_enclosed(setup: Setup, plan: Plan) -> bool:
-    """Return whether f̃ has an enclosure by the rules for its operations: for a law in closed form on
-    pointwise intervals."""
+    """Return whether f̃ has an enclosure over a step in the way of a plan: its operations have rules, K
+    is a box or does not move, and the moduli of a law without closed form are known."""
     problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
-    if problem.set_at(t0, _tree.as_arrays(setup.args)).intervals(problem.zero_control(x0)) is None:
+    if not plan.closed_form and not _MODULI <= set(setup.moduli):
         return False
-    flow = plan.flow(setup)
-    enclosure = lambda t, x: flow.enclosure(constant(t), constant(x), None, None)  # noqa: E731
-    return has_enclosure(enclosure, t0, x0)
-
-
-def _is_interpolated(setup: Setup) -> bool:
-    """Return whether the response over a step is enclosed from its values at the ends: if the moduli
-    of the law are known, f and h have enclosures, and K is a box, or a polyhedral set that does not
-    move."""
-    if not _MODULI <= set(setup.moduli):
-        return False
-    problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
     args, like = _tree.as_arrays(setup.args), problem.zero_control(x0)
     K = problem.set_at(t0, args)
-    if not is_polyhedral(K, like):
+    is_box = K.intervals(like) is not None
+    data = lambda t: jtu.tree_leaves(problem.set_at(t, args))  # noqa: E731
+    # Without moduli nothing is certified, and a defect that is sampled allows longer steps.
+    if not is_box and not (setup.moduli and independent(data, t0)):
         return False
-    functions = [problem.f, problem.h]
-    if K.intervals(like) is not None:
-        functions.append(lambda t, x, u, args: problem.set_at(t, args).intervals(like))
-    elif not independent(lambda t: jtu.tree_leaves(problem.set_at(t, args)), t0):
+    if plan.closed_form and plan.interpolated and (is_box or not is_polyhedral(K)):
         return False
-    return all(
-        has_enclosure(
-            lambda *at, fn=fn: enclose(lambda *at: fn(*at, args), *map(constant, at)), t0, x0, like
-        )
-        for fn in functions
-    )
+    zero = jnp.zeros((), _tree.dtype(x0))
+    rate = Rate(x0, like, like, zero, zero > 0, jnp.asarray(0), None, like)
+    flow = plan.flow(setup)
+    enclosure = lambda t, x: flow.enclosure(constant(t), constant(x), rate, rate)  # noqa: E731
+    return has_enclosure(enclosure, t0, x0)
 
 
 def _small_box(setup: Setup) -> AbstractSmallBox:

@@ -1,0 +1,117 @@
+"""Enclosures of projections onto a set that does not move.
+
+*Of a line, by its ends.* Let yₖ = proj_K(zₖ) for k = 0, 1, and vₖ ∈ N_K(yₖ), say zₖ − yₖ. For lines y
+and v between their values at the ends, and every k ∈ K,
+
+    ⟨v(θ), k − y(θ)⟩ ≤ θ(1 − θ)g ≤ g/4,   g = ⟨v₁ − v₀, y₁ − y₀⟩ ≥ 0.
+
+For a polyhedral K with the same active constraints at both ends, g = 0. Otherwise g = O(h²) for ends at
+a distance O(h). The projection need not have rules.
+
+*By rules.* On one side of a kink the rules of enclosures apply. Over a kink proj_K(z(θ)) differs from
+the line between its ends by at most 2θ(1 − θ)‖z₁ − z₀‖ if z is a line, since proj_K is nonexpansive.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .. import _tree
+from .._tree import Tree
+from ..programs.enclosure import LinearEnclosure, constant, enclose, has_enclosure, is_enclosure
+from ..sets import AbstractSet, Ball, Ellipsoid, Intersection, SecondOrderCone
+from ..sets._library import is_of_library, sets_in
+from ..spaces import AbstractSpace
+
+_NOT_POLYHEDRAL = (Ball, Ellipsoid, SecondOrderCone, Intersection)
+
+_ROUNDINGS = 1e4
+"""Error of a projection that is no box, in units of ε times the size of z and y."""
+
+
+def is_polyhedral(K: AbstractSet) -> bool:
+    """Return whether K is known to be a polyhedral set with an exact projection."""
+    return is_of_library(K) and not any(isinstance(s, _NOT_POLYHEDRAL) for s in sets_in(K))
+
+
+def has_rules(K: AbstractSet, space: AbstractSpace, like: Tree) -> bool:
+    """Return whether the projection onto K has an enclosure by rules."""
+    by_rules = lambda z: by_its_rules(K, space, constant(z))  # noqa: E731
+    return not isinstance(K, Intersection) and has_enclosure(by_rules, like)
+
+
+def by_its_rules(K: AbstractSet, space: AbstractSpace, z: Tree) -> Tree:
+    """Return the enclosure of proj_K(z) for an enclosure of z.
+
+    **Raises:** `NoEnclosure` if the projection uses an operation without a rule.
+    """
+    found = enclose(lambda z: K.project(z, space), z)
+    change = part(jtu.tree_map(_change, z, is_leaf=is_enclosure), "dev")
+    most = 0.5 * space.norm(change) + space.norm(part(z, "dev"))
+    return widened(found, most, space, jnp.minimum)
+
+
+def widened(enclosures: Tree, by: Any, space: AbstractSpace, join: Any = jnp.add) -> Tree:
+    """Return enclosures with their deviations joined to the largest entries of elements of a norm."""
+
+    def one(q: LinearEnclosure, w: jax.Array) -> LinearEnclosure:
+        return q._replace(dev=jnp.broadcast_to(join(q.dev, by / jnp.sqrt(w)), q.a.shape))
+
+    return jtu.tree_map(one, enclosures, space.weights(), is_leaf=is_enclosure)
+
+
+def part(enclosures: Tree, name: str) -> Tree:
+    """Return the starts "a", the ends "b" or the deviations "dev"."""
+    return jtu.tree_map(lambda q: getattr(q, name), enclosures, is_leaf=is_enclosure)
+
+
+def _change(q: LinearEnclosure) -> LinearEnclosure:
+    return q._replace(dev=jnp.abs(q.b - q.a))
+
+
+def rounding_of(space: AbstractSpace, *pairs: tuple[Tree, Tree]) -> jax.Array:
+    """Return a bound on the errors of projections y of z, for pairs of both."""
+    size = jnp.max(jnp.stack([space.norm(z) + space.norm(y) for z, y in pairs]))
+    return _ROUNDINGS * jnp.finfo(size.dtype).eps * size
+
+
+def gap(
+    space: AbstractSpace, y: tuple[Tree, Tree], v: tuple[Tree, Tree],
+    switches: tuple[list[jax.Array] | None, list[jax.Array] | None], stretch: Any, rounding: Any,
+) -> jax.Array:  # fmt: skip
+    """Return g for v = σ(z − y) with σ up to `stretch`, and y up to `rounding`; 0 for the same active
+    constraints, at which no switch function changes its sign."""
+    of_y, of_v = _tree.sub(y[1], y[0]), _tree.sub(v[1], v[0])
+    doubt = 2.0 * rounding * (space.norm(of_v) + stretch * (space.norm(of_y) + 2.0 * rounding))
+    g = jnp.maximum(space.inner(of_v, of_y), 0.0)
+    first, last = switches
+    if first is None or last is None:
+        return g + doubt
+    same = g <= doubt
+    for a, b in zip(first, last, strict=True):
+        same &= jnp.all(((a > rounding) & (b > rounding)) | ((a < -rounding) & (b < -rounding)))
+    return jnp.where(same, 0.0, g + doubt)
+
+
+def gap_of_box(
+    space: AbstractSpace, y: tuple[Tree, Tree], v: tuple[Tree, Tree], bounds: tuple[Tree, Tree]
+) -> jax.Array:
+    """Return g for a box whose bounds are lines l and b: with s⁺ = max(s, 0) and s⁻ = max(−s, 0)
+
+    g = ⟨v₀⁺, b₁ − y₁⟩ + ⟨v₁⁺, b₀ − y₀⟩ + ⟨v₀⁻, y₁ − l₁⟩ + ⟨v₁⁻, y₀ − l₀⟩."""
+
+    def of_leaf(y0: Any, y1: Any, v0: Any, v1: Any, low: Any, up: Any) -> jax.Array:
+        return (
+            _product(v0, up.b - y1) + _product(v1, up.a - y0)
+            + _product(-v0, y1 - low.b) + _product(-v1, y0 - low.a)
+        )  # fmt: skip
+
+    terms = jtu.tree_map(of_leaf, *y, *v, *bounds)
+    return space.inner(terms, jtu.tree_map(jnp.ones_like, terms))
+
+
+def _product(v: jax.Array, slack: jax.Array) -> jax.Array:
+    """Return v⁺ times a slack, which may be infinite where v⁺ = 0."""
+    return jnp.where(v > 0.0, v * slack, 0.0)
