@@ -1,0 +1,275 @@
+"""Laws on polyhedral sets, balls and cones: enclosures between two points, bounds of trajectories."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from tests.once import once
+from tests.selection import mostly_thorough
+
+import dvax
+from dvax import sets
+from dvax.evolution.enclosed_projection import by_its_rules
+from dvax.evolution.interpolated_response import Place, interpolated, interpolated_projection
+from dvax.programs.enclosure import LinearEnclosure, constant, straight
+from dvax.sets._conditions import conditions
+from dvax.theory.faces import Range, derivatives_on_faces
+
+N = 4
+WEIGHTED = dvax.spaces.L2(jnp.array([0.3, 1.0, 2.0, 0.7]))
+EUCLIDEAN = dvax.spaces.Euclidean(N)
+
+
+def polyhedron(rng: np.random.Generator) -> sets.Polyhedron:
+    return sets.Polyhedron(rng.normal(size=(5, N)), rng.uniform(0.1, 1.0, size=5))
+
+
+def with_equation(rng: np.random.Generator) -> sets.Polyhedron:
+    E = rng.normal(size=(1, N))
+    return sets.Polyhedron(rng.normal(size=(3, N)), rng.uniform(0.1, 1.0, 3), E, np.zeros(1))
+
+
+def constrained_box(rng: np.random.Generator) -> sets.ConstrainedBox:
+    R = rng.normal(size=(2, N))
+    return sets.ConstrainedBox(-np.ones(N), np.ones(N), R, [-0.3, 0.0], [0.2, 0.0])
+
+
+POLYHEDRAL = {
+    "simplex": lambda rng: sets.Simplex(1.0),
+    "simplices": lambda rng: sets.Simplex(jnp.array([1.0, 0.5]), sizes=(3, 1)),
+    "polyhedron": polyhedron,
+    "with an equation": with_equation,
+    "constrained box": constrained_box,
+    "half-space": lambda rng: sets.HalfSpace(rng.normal(size=N), 0.3),
+    "hyperplane": lambda rng: sets.Hyperplane(rng.normal(size=N), 0.3),
+    "affine": lambda rng: sets.AffineSubspace(rng.normal(size=(2, N)), np.array([0.1, 0.2])),
+    "translated": lambda rng: sets.Translated(sets.Simplex(1.0), rng.normal(size=N)),
+    "L1": lambda rng: sets.L1Ball(np.zeros(N), 0.5),
+}
+CURVED = {
+    "ball": lambda rng: sets.Ball(jnp.zeros(N), 0.6),
+    "cone": lambda rng: sets.SecondOrderCone(0.8),
+}
+
+
+@once
+def placed():
+    """Compiled programs of sets: y and the switch functions at z."""
+
+    def place(K, space, z):
+        return Place(z, K.project(z, space), K.switches(z, space))
+
+    return jax.jit(place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", POLYHEDRAL)
+def test_projection_of_a_line_stays_near_the_line_between_its_ends(name):
+    rng = np.random.default_rng(0)
+    same = 0
+    enclosed = jax.jit(interpolated_projection)
+    for trial in range(30):
+        K, space = POLYHEDRAL[name](rng), (EUCLIDEAN, WEIGHTED)[trial % 2]
+        a = jnp.asarray(rng.normal(size=N))
+        b = a + 10.0 ** rng.uniform(-5, 0.5) * rng.normal(size=N)
+        line, apart = enclosed(
+            space, straight(a, b), (placed()(K, space, a), placed()(K, space, b))
+        )
+        thetas = np.linspace(0.0, 1.0, 33)[:, None]
+        on = lambda p, q, thetas=thetas: (1 - thetas) * np.asarray(p) + thetas * np.asarray(q)  # noqa: E731
+        y = jax.vmap(lambda z, K=K, space=space: placed()(K, space, z).y)(on(a, b))
+        distance = jax.vmap(space.norm)(y - on(line.a, line.b))
+        assert float(jnp.max(distance)) <= float(apart)
+        assert float(apart) <= float(space.norm(b - a)) + 1e-6
+        same += float(apart) <= 1e-10
+    assert same >= 5, "no line stayed on a face"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CURVED)
+def test_projection_onto_a_curved_set_is_enclosed_on_both_sides_and_over_the_kink(name):
+    rng = np.random.default_rng(1)
+    K, smooth = CURVED[name](rng), 0
+    # The projection onto a cone in a weighted space finds a root, and has no rules.
+    for space in (EUCLIDEAN,) if name == "cone" else (EUCLIDEAN, WEIGHTED):
+        enclosed = jax.jit(lambda a, b, space=space: by_its_rules(K, space, straight(a, b)))
+        project = jax.jit(jax.vmap(lambda z, space=space: K.project(z, space)))
+        for _ in range(60):
+            a, length = rng.normal(size=N), 10.0 ** rng.uniform(-4, 0.5)
+            b = a + length * rng.normal(size=N)
+            q = LinearEnclosure(*map(np.asarray, enclosed(a, b)))
+            thetas = np.linspace(0.0, 1.0, 33)[:, None]
+            y = project((1 - thetas) * a + thetas * b)
+            assert (np.abs(y - ((1 - thetas) * q.a + thetas * q.b)) <= q.dev + 1e-14).all()
+            assert float(np.max(q.dev)) <= 2.0 * np.linalg.norm(b - a)
+            smooth += float(np.max(q.dev)) <= 1e-2 * length
+    assert smooth >= 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in POLYHEDRAL if name != "L1"])
+def test_conditions_of_a_set_hold_on_it_and_nowhere_else(name):
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        K = POLYHEDRAL[name](rng)
+        found = conditions(K, jnp.zeros(N))
+        for z in rng.normal(size=(20, N)):
+            y = np.asarray(placed()(K, EUCLIDEAN, jnp.asarray(z)).y)
+            values = found.R @ y
+            assert (values <= found.high + 1e-9).all() and (values >= found.low - 1e-9).all()
+            # Elsewhere one is violated.
+            values = found.R @ z
+            holds = (values <= found.high + 1e-12).all() and (values >= found.low - 1e-12).all()
+            assert holds == (np.abs(y - z).max() <= 1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in POLYHEDRAL if name != "L1"])
+def test_differences_of_projections_are_those_of_the_faces(name):
+    """p = D(p + q) for the differences p of y and q of z − y, with D between its bounds."""
+    rng = np.random.default_rng(3)
+    known = unknown = 0
+    for _ in range(40):
+        K = POLYHEDRAL[name](rng)
+        found = conditions(K, jnp.zeros(N))
+        z = rng.normal(size=N) * rng.uniform(0.2, 2.0)
+        others = z + 10.0 ** rng.uniform(-4, 0) * rng.normal(size=(6, N))
+        points = [z, *others]
+        y = np.stack([np.asarray(placed()(K, EUCLIDEAN, jnp.asarray(v)).y) for v in points])
+        s = np.stack(points) - y
+        boxes = [Range(v.min(axis=0)[None], v.max(axis=0)[None]) for v in (y, s)]
+        (center, radius), is_known = derivatives_on_faces(found, *boxes, 1e-14)
+        for k in range(1, len(points)):
+            p, q = y[k] - y[0], s[k] - s[0]
+            assert (np.abs(p - center[0] @ (p + q)) <= radius[0] @ np.abs(p + q) + 1e-11).all()
+        known, unknown = known + int(is_known[0]), unknown + int(not is_known[0])
+    assert known >= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*POLYHEDRAL, *CURVED])
+def test_response_between_two_points_is_near_the_line_between_their_responses(name):
+    """For F(y) = My + sin(y)/4 − q(t) along a line in t, with all its constants by hand."""
+    rng = np.random.default_rng(4)
+    make = POLYHEDRAL.get(name) or CURVED[name]
+    turned = 0.4 * rng.normal(size=(N, N))
+    M = 1.5 * np.eye(N) + turned - turned.T
+    gamma, L_F = 1.25, float(np.linalg.norm(M, 2)) + 0.25
+    P = dvax.operators.Scaling(1.0)
+    K = make(rng)
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=P, K=K, control_space=EUCLIDEAN, f=lambda t, x, u, q: 0.0 * u,
+        h=lambda t, x, u, q: u - M @ u - 0.25 * jnp.sin(u) + q[0] + t * q[1] + t * t * q[2],
+    )  # fmt: skip
+    F = lambda y, q: M @ y + 0.25 * jnp.sin(y) - q  # noqa: E731
+    solve = lambda q: dvax.solve_vi(F, K, jnp.zeros(N), q, gamma=gamma, L_F=L_F, tol=1e-12)  # noqa: E731
+    x = constant(jnp.zeros(N))
+
+    @jax.jit
+    def between(t, q, y):
+        ends = [
+            placed()(K, EUCLIDEAN, v - F(v, q[0] + s * q[1] + s * s * q[2]))
+            for v, s in zip(y, (t.a, t.b), strict=True)
+        ]
+        return interpolated(problem, q, P, t, x, tuple(ends), gamma, L_F)
+
+    for length in (1.0, 1e-1, 1e-2, 1e-3):
+        q = jnp.asarray(rng.normal(size=(3, N)))
+        at = lambda s, q=q: q[0] + s * q[1] + s * s * q[2]  # noqa: E731
+        t = LinearEnclosure(jnp.asarray(0.0), jnp.asarray(length), jnp.asarray(0.0))
+        line = between(t, q, (solve(at(0.0)).y, solve(at(length)).y))
+        for theta in (0.2, 0.5, 0.9):
+            exact = solve(at(theta * length)).y
+            guess = (1 - theta) * line.u.a + theta * line.u.b
+            distance = float(jnp.linalg.norm(exact - guess))
+            assert distance <= float(line.residual) / gamma + 1e-11
+        assert float(line.residual) <= 30.0 * length + 1e-6
+
+
+def random_system(seed: int, make, motion: float = 0.0):
+    rng = np.random.default_rng(seed)
+    m = 2
+    A = -rng.uniform(0.2, 2.0) * np.eye(m) + rng.normal(size=(m, m))
+    B, C = rng.normal(size=(m, N)), rng.normal(size=(N, m))
+    S = rng.normal(size=(N, N)) / N
+    P = np.eye(N) * rng.uniform(0.5, 2.0) + 0.2 * (S + S.T)
+    fast, phase = rng.uniform(1.0, 4.0), rng.uniform(0.0, 6.0, size=N)
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(A), P=dvax.operators.Dense(P), K=make(rng),
+        f=lambda t, x, u, args: B @ u + 0.3 * jnp.sin(x) * jnp.cos(t), control_space=EUCLIDEAN,
+        h=lambda t, x, u, args: C @ x + jnp.sin(fast * t + phase) - 0.2 * jnp.tanh(P @ u),
+    )  # fmt: skip
+    return problem, rng.normal(size=m)
+
+
+MOVING = {
+    "moving box": lambda rng: (
+        lambda t, args: sets.Box(
+            -0.4 - 0.3 * jnp.sin(2.0 * t) * jnp.ones(N), 0.3 + 0.2 * jnp.cos(t) * jnp.ones(N)
+        )
+    )
+}
+SYSTEMS = {**POLYHEDRAL, **CURVED, **MOVING}
+CASES = [(name, seed) for name in SYSTEMS for seed in range(3)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seed"), mostly_thorough(CASES, [("simplex", 0)]))
+def test_bounds_along_trajectories_of_coupled_laws_are_proved_hold_and_are_sharp(name, seed):
+    problem, x0 = random_system(seed, SYSTEMS[name])
+    ts = np.linspace(0.0, 2.0, 6)[1:]
+    run = partial(dvax.solve, problem, x0, 0.0, 2.0, ts=ts)
+    sol, exact = run(rtol=1e-5), run(rtol=1e-11, atol=1e-12, method=dvax.DormandPrince())
+    bound = dvax.bound_error(problem, sol)
+    of_x = np.linalg.norm(sol.xs - exact.xs, axis=1)
+    of_u = np.linalg.norm(sol.us - exact.us, axis=1)
+    assert bound.status == "proved", bound
+    assert (of_x <= np.asarray(bound.x) + 1e-10).all()
+    assert (of_u <= np.asarray(bound.u) + 1e-10).all()
+    assert (np.asarray(bound.x) <= 20.0 * of_x + 1e-5).all()
+
+
+@once
+def affine_law():
+    """x' = Ax + u, u = x + c on {y : ⟨a, y⟩ = b}: a linear system."""
+    rng = np.random.default_rng(7)
+    A, a, c = rng.normal(size=(3, 3)) - 2.0 * np.eye(3), rng.normal(size=3), rng.normal(size=3)
+    problem = dvax.Problem(
+        A=dvax.generators.Dense(A), P=dvax.operators.Scaling(1.0), K=sets.Hyperplane(a, 0.4),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: x + c,
+        control_space=dvax.spaces.Euclidean(3),
+    )  # fmt: skip
+    E = np.eye(3) - np.outer(a, a) / (a @ a)
+    forcing = E @ c + 0.4 * a / (a @ a)
+    return problem, A + E, forcing
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gamma", [1.0, 0.5, 0.1])
+def test_bound_by_constants_holds_with_a_smaller_modulus_than_that_of_the_run(gamma):
+    """A closed form, x' = (A + E)x + p with the projection E. The defect of the law was enclosed by one
+    γ, and the certificate has another one."""
+    problem, matrix, forcing = affine_law()
+    x0 = np.array([1.0, -0.5, 0.3])
+    given = dvax.verify(problem, x0, 0.0, 2.0).constants
+    statuses = dict(given.statuses)
+    names = ("L_F", "alpha_h", "beta_h", "alpha_f", "beta_f", "M", "omega", "m_P", "norm_P_inv")
+    other = dvax.Constants(
+        gamma=gamma, **{name: getattr(given, name) for name in names}, domain=given.domain,
+        status={name: status for name, status in statuses.items() if name in (*names, "gamma")},
+    )  # fmt: skip
+    big = np.zeros((4, 4))
+    big[:3, :3], big[:3, 3] = matrix, forcing
+    exact = (expm(2.0 * big) @ np.append(x0, 1.0))[:3]
+    for used in (given, other):
+        sol = dvax.solve(problem, x0, 0.0, 2.0, rtol=1e-5, method=dvax.ETD2RK(), constants=used)
+        assert sol.enclosed
+        for constants in (given, other):
+            bound = dvax.bound_error(problem, sol, constants)
+            assert bound.status == "proved"
+            assert np.linalg.norm(sol.xs[-1] - exact) <= float(bound.x[-1])
+            # Errors grow with ‖∂h/∂x‖/γ in it.
+            assert gamma < 0.5 or float(bound.x[-1]) < 0.1
