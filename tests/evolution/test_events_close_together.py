@@ -154,7 +154,7 @@ def test_values_that_events_read_are_noticed_when_they_change():
 
 
 @pytest.mark.slow
-def test_events_that_are_written_anew_compile_nothing():
+def test_events_that_are_written_again_compile_nothing():
     again = lambda: dvax.solve(  # noqa: E731
         clock(), 0.0, 0.0, 1.0, events=[dvax.Event(lambda t, x, u, args: x - 0.25)]
     )

@@ -111,8 +111,9 @@ def solve(
       saved time, for the exact x0: steps are chosen, in a few runs, until `dvax.bound_error` with
       these `constants` says so (`rtol` and `atol` are then not used). The bound that was reached is
       in `stats["certified_bound"]`, or in `stats["estimated_bound"]` where the defect was sampled and
-      not enclosed (`sol.enclosed`): methods of order above 2, and laws without closed form. A tolerance
-      out of reach is refused after one cheap run, with the least bound in reach and what limits it.
+      not enclosed (`sol.enclosed`): methods of order above 2, and sets that move but are no boxes. A
+      tolerance out of reach is refused after one cheap run, with the least bound in reach and what
+      limits it.
       Constants of a region hold while x and u stay in it. This is checked at 256 more times;
       between them you must check it yourself;
     - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
