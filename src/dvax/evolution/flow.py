@@ -241,12 +241,15 @@ class Flow(eqx.Module):
 
     def _place(self, t: Any, x: Tree, rate: Rate | None) -> Place:
         assert rate is not None
-        y = rate.nearest
+        start, y, switches = part(x, "a"), rate.nearest, rate.switches
+        K, space = self.set_at(t), self.problem.spaces(start)[1]
         if y is None and self.direct and self.small_box is None:
             y = rate.y
         elif y is None:
-            y = self.set_at(t).project(rate.z, self.problem.spaces(part(x, "a"))[1])
-        return jax.lax.stop_gradient(Place(rate.z, y, rate.switches))
+            y = K.project(rate.z, space)
+        if switches is None and not self.iterates and K.intervals(y) is None:
+            switches = K.switches(rate.z, space)
+        return jax.lax.stop_gradient(Place(rate.z, y, switches))
 
     def _enclosed_response(
         self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
