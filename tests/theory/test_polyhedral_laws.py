@@ -1,7 +1,9 @@
 """Laws on polyhedral sets, balls and cones: enclosures between two points, bounds of trajectories."""
 
+from collections.abc import Callable
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,7 +78,7 @@ def test_projection_of_a_line_stays_near_the_line_between_its_ends(name):
         a = jnp.asarray(rng.normal(size=N))
         b = a + 10.0 ** rng.uniform(-5, 0.5) * rng.normal(size=N)
         line, apart = enclosed(
-            space, straight(a, b), (placed()(K, space, a), placed()(K, space, b))
+            K, space, straight(a, b), (placed()(K, space, a), placed()(K, space, b))
         )
         thetas = np.linspace(0.0, 1.0, 33)[:, None]
         on = lambda p, q, thetas=thetas: (1 - thetas) * np.asarray(p) + thetas * np.asarray(q)  # noqa: E731
@@ -273,3 +275,97 @@ def test_bound_by_constants_holds_with_a_smaller_modulus_than_that_of_the_run(ga
             assert np.linalg.norm(sol.xs[-1] - exact) <= float(bound.x[-1])
             # Errors grow with ‖∂h/∂x‖/γ in it.
             assert gamma < 0.5 or float(bound.x[-1]) < 0.1
+
+
+class Opening(sets.AbstractSet):
+    """{y : Σ y ≤ b()} with a bound that the set holds as a function."""
+
+    bound: Callable = eqx.field(static=True)
+
+    def project(self, z, space):
+        return z - jnp.maximum(jnp.sum(z) - self.bound(), 0.0) / z.size
+
+    def switches(self, z, space):
+        return None
+
+    def intervals(self, like):
+        return None
+
+    def check(self, like):
+        pass
+
+
+@pytest.mark.slow
+def test_set_of_the_user_that_holds_a_function_of_time_is_not_taken_as_fixed():
+    """x' = −x + u with u = sin²(10πt)/2 in both components: steps of 0.1 see K at its zeros alone."""
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+        K=lambda t, args: Opening(lambda: jnp.sin(10.0 * jnp.pi * t) ** 2),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: 2.0 * jnp.ones(2),
+    )  # fmt: skip
+    x0, w = jnp.zeros(2), 20.0 * np.pi
+    part = lambda t: 0.25 - 0.25 * (np.cos(w * t) + w * np.sin(w * t)) / (1.0 + w * w)  # noqa: E731
+    exact = (part(2.0) - np.exp(-2.0) * part(0.0)) * np.ones(2)
+    constants = dvax.verify(problem, x0, 0.0, 2.0).constants
+    sol = dvax.solve(
+        problem, x0, 0.0, 2.0, ts=[2.0], method=dvax.ETD2RK(), constants=constants, dt=0.1
+    )
+    bound = dvax.bound_error(problem, sol, constants)
+    assert not sol.enclosed
+    error = np.linalg.norm(sol.xs[-1] - exact)
+    assert bound.status != "proved" or error <= float(bound.x[-1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", [1e-3, 1e-5, 1e-7, 1e-9, 1e-12])
+def test_equations_that_are_nearly_parallel_do_not_lower_the_bound(angle):
+    """y₁ = y₂ = 0 by two equations, and x₂ grows like e^{t/2} from an initial error."""
+    E = jnp.array([[1.0, 0.0, 0.0], [1.0, angle, 0.0]])
+    problem = dvax.Problem(
+        A=dvax.generators.Diagonal(jnp.array([-1.0, 0.5, -1.0])), P=dvax.operators.Scaling(1.0),
+        K=sets.AffineSubspace(E, jnp.zeros(2)), f=lambda t, x, u, args: u,
+        h=lambda t, x, u, args: jnp.array([0.0, -3.0, -3.0]) * x,
+    )  # fmt: skip
+    x0 = jnp.array([0.0, 1.0, 1.0])
+    sol = dvax.solve(problem, x0, 0.0, 2.0, ts=[2.0])
+    bound = dvax.bound_error(problem, sol, initial_error=1e-3)
+    # Where the projection itself takes them as one equation, y₂ is free and decays.
+    grows = abs(float(sol.xs[-1, 1]) - np.e) < 1e-3
+    assert not grows or abs(float(sol.xs[-1, 1]) - 1.001 * np.e) <= float(bound.x[-1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["simplex", "half-space", "constrained box", "polyhedron", "ball"])
+def test_runs_with_constants_end_in_single_precision(name):
+    make = POLYHEDRAL.get(name) or CURVED[name]
+    K = jax.tree_util.tree_map(
+        lambda leaf: leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf,
+        jax.tree_util.tree_map(jnp.asarray, make(np.random.default_rng(5))),
+    )
+    turned = jnp.eye(N, dtype=jnp.float32) + jnp.asarray(
+        np.triu(0.3 * np.ones((N, N)), 1) - np.tril(0.3 * np.ones((N, N)), -1), jnp.float32
+    )
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(np.float32(-1.0)), K=K,
+        P=dvax.operators.Scaling(np.float32(1.0)), f=lambda t, x, u, args: u,
+        h=lambda t, x, u, args: u - turned @ u + x,
+    )  # fmt: skip
+    x0 = np.linspace(1.0, 0.5, N, dtype=np.float32)
+    with jax.numpy_dtype_promotion("standard"):
+        constants = dvax.verify(problem, x0, 0.0, 2.0).constants
+        sol = dvax.solve(
+            problem, x0, 0.0, 2.0, ts=[2.0], method=dvax.ETD2RK(), constants=constants,
+            rtol=3e-4, atol=3e-4,
+        )  # fmt: skip
+        bound = dvax.bound_error(problem, sol, constants)
+    sharp = dvax.solve(
+        dvax.Problem(
+            A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+            K=make(np.random.default_rng(5)), f=problem.f,
+            h=lambda t, x, u, args: u - np.asarray(turned, float) @ u + x,
+        ),
+        np.asarray(x0, float), 0.0, 2.0, ts=[2.0], rtol=1e-9, atol=1e-10,
+    )  # fmt: skip
+    assert sol.enclosed and bound.status == "proved" and int(sol.stats["steps"]) < 500
+    error = np.linalg.norm(np.asarray(sol.xs[-1], float) - sharp.xs[-1])
+    assert error <= float(bound.x[-1]) <= 0.05

@@ -109,7 +109,8 @@ def enclosed(
     defect = 0.5 * h * (space.norm(at_start) + space.norm(at_end))
     if flow.interpolated:
         # Any part of f̃ may have the effect.
-        error = jtu.tree_map(lambda e: e + effect / jnp.sqrt(space.size()), error)
+        mean = effect / jnp.sqrt(space.size()).astype(effect.dtype)
+        error = jtu.tree_map(lambda e: e + mean, error)
         u = widened(u, apart, flow.problem.spaces(x0)[1])
     bounds = Bounds.of_enclosures(x, u)
     return Sample((), [rates[1]], error, defect, h * law_residual, bounds)

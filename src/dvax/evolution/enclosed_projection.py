@@ -12,7 +12,7 @@ a distance O(h). The projection need not have rules.
 the line between its ends by at most 2θ(1 − θ)‖z₁ − z₀‖ if z is a line, since proj_K is nonexpansive.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +21,30 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._tree import Tree
 from ..programs.enclosure import LinearEnclosure, constant, enclose, has_enclosure, is_enclosure
-from ..sets import AbstractSet, Ball, Ellipsoid, Intersection, SecondOrderCone
+from ..sets import (
+    AbstractSet,
+    Ball,
+    ConstrainedBox,
+    Ellipsoid,
+    Intersection,
+    Polyhedron,
+    SecondOrderCone,
+)
 from ..sets._library import is_of_library, sets_in
 from ..spaces import AbstractSpace
 
 _NOT_POLYHEDRAL = (Ball, Ellipsoid, SecondOrderCone, Intersection)
 
-_ROUNDINGS = 1e4
-"""Error of a projection that is no box, in units of ε times the size of z and y."""
+_ROUNDINGS, _ITERATED = 256.0, 0.75
+"""Error of a projection relative to the size of z and y: in units of ε, or as a power of ε where active
+sets are iterated."""
+
+
+class Gap(NamedTuple):
+    """A bound on g, and its value as computed, 0 where it is roundoff."""
+
+    bound: jax.Array
+    resolved: jax.Array
 
 
 def is_polyhedral(K: AbstractSet) -> bool:
@@ -57,7 +73,8 @@ def widened(enclosures: Tree, by: Any, space: AbstractSpace, join: Any = jnp.add
     """Return enclosures with their deviations joined to the largest entries of elements of a norm."""
 
     def one(q: LinearEnclosure, w: jax.Array) -> LinearEnclosure:
-        return q._replace(dev=jnp.broadcast_to(join(q.dev, by / jnp.sqrt(w)), q.a.shape))
+        largest = (by / jnp.sqrt(w)).astype(q.dev.dtype)
+        return q._replace(dev=jnp.broadcast_to(join(q.dev, largest), q.a.shape))
 
     return jtu.tree_map(one, enclosures, space.weights(), is_leaf=is_enclosure)
 
@@ -71,16 +88,18 @@ def _change(q: LinearEnclosure) -> LinearEnclosure:
     return q._replace(dev=jnp.abs(q.b - q.a))
 
 
-def rounding_of(space: AbstractSpace, *pairs: tuple[Tree, Tree]) -> jax.Array:
-    """Return a bound on the errors of projections y of z, for pairs of both."""
+def rounding_of(K: AbstractSet, space: AbstractSpace, *pairs: tuple[Tree, Tree]) -> jax.Array:
+    """Return a bound on the errors of projections y of z onto K, for pairs of both."""
     size = jnp.max(jnp.stack([space.norm(z) + space.norm(y) for z, y in pairs]))
-    return _ROUNDINGS * jnp.finfo(size.dtype).eps * size
+    is_iterated = any(isinstance(s, Polyhedron | ConstrainedBox) for s in sets_in(K))
+    eps = float(jnp.finfo(size.dtype).eps)
+    return (eps**_ITERATED if is_iterated else _ROUNDINGS * eps) * size
 
 
 def gap(
     space: AbstractSpace, y: tuple[Tree, Tree], v: tuple[Tree, Tree],
     switches: tuple[list[jax.Array] | None, list[jax.Array] | None], stretch: Any, rounding: Any,
-) -> jax.Array:  # fmt: skip
+) -> "Gap":  # fmt: skip
     """Return g for v = σ(z − y) with σ up to `stretch`, and y up to `rounding`; 0 for the same active
     constraints, at which no switch function changes its sign."""
     of_y, of_v = _tree.sub(y[1], y[0]), _tree.sub(v[1], v[0])
@@ -88,11 +107,13 @@ def gap(
     g = jnp.maximum(space.inner(of_v, of_y), 0.0)
     first, last = switches
     if first is None or last is None:
-        return g + doubt
+        return Gap(g + doubt, g)
     same = g <= doubt
     for a, b in zip(first, last, strict=True):
-        same &= jnp.all(((a > rounding) & (b > rounding)) | ((a < -rounding) & (b < -rounding)))
-    return jnp.where(same, 0.0, g + doubt)
+        positive, negative = (a > rounding) & (b > rounding), (a < -rounding) & (b < -rounding)
+        # An equation has a constant.
+        same &= jnp.all(positive | negative | ((a == b) & (a != 0)))
+    return Gap(jnp.where(same, 0.0, g + doubt), jnp.where(g <= doubt, 0.0, g))
 
 
 def gap_of_box(

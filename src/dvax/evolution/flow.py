@@ -46,7 +46,7 @@ class Rate(NamedTuple):
     `value` = f(t, x, u); y = P u; `z`, whose projection onto K is y (both None where not kept);
     `residual` = ‖w‖ of the frozen solve; `solved`, whether it met its tolerance; `evaluations` of F;
     `switches`, the switch functions of K at z, where the flow keeps them (`Flow.keeps_switches`);
-    `nearest`, the projection of z where y is only close to it and the flow is `interpolated`.
+    `place`, what an `interpolated` flow needs of the ends of a step.
     """
 
     value: Tree
@@ -56,13 +56,13 @@ class Rate(NamedTuple):
     solved: jax.Array
     evaluations: jax.Array
     switches: list[jax.Array] | None = None
-    nearest: Tree | None = None
+    place: Place | None = None
 
 
 class EnclosedRate(NamedTuple):
     """Enclosures over a step: of f(t, x, u) in `value`, of a line or of the response in `u`; and bounds
-    on the distance of the response from this u: `law_residual`/γ for y, `apart` for all u, and
-    `effect` of it on f̃ (0 if u is the response)."""
+    on the distance of the response from this u: `law_residual`/γ for y, `apart` for u, and the `effect`
+    on f̃, without roundoff (0 if u is the response)."""
 
     value: Tree
     u: Tree
@@ -233,23 +233,39 @@ class Flow(eqx.Module):
             u = self._enclosed_response(t, x, first, last)
             zero = jnp.zeros_like(t.dev)
             return EnclosedRate(enclose(f, t, x, u), u, zero, zero, zero)
-        places = self._place(t.a, x, first), self._place(t.b, x, last)
-        line = interpolated(problem, args, self.operator, t, x, places, self.gamma, self.L_F)
-        apart = line.residual / self.gamma
-        effects = self.norm_P_inv * apart, self.tol.gain * apart
+        places = self._places(t, x, first, last)
+        # In the precision of the run, and no sharper than they are.
+        dtype = t.a.dtype
+        more = 1.0 + 4.0 * float(jnp.finfo(dtype).eps)
+        gamma = jnp.asarray(self.gamma / more, dtype)
+        L_F, norm_P_inv, gain = (
+            jnp.asarray(v * more, dtype) for v in (self.L_F, self.norm_P_inv, self.tol.gain)
+        )
+        line = interpolated(problem, args, self.operator, t, x, places, gamma, L_F)
+        effects = norm_P_inv * line.residual / gamma, gain * line.resolved / gamma
         return EnclosedRate(enclose(f, t, x, line.u), line.u, line.residual, *effects)
 
-    def _place(self, t: Any, x: Tree, rate: Rate | None) -> Place:
-        assert rate is not None
-        start, y, switches = part(x, "a"), rate.nearest, rate.switches
-        K, space = self.set_at(t), self.problem.spaces(start)[1]
-        if y is None and self.direct and self.small_box is None:
-            y = rate.y
-        elif y is None:
-            y = K.project(rate.z, space)
-        if switches is None and not self.iterates and K.intervals(y) is None:
-            switches = K.switches(rate.z, space)
-        return jax.lax.stop_gradient(Place(rate.z, y, switches))
+    def _places(
+        self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
+    ) -> tuple[Place, Place]:
+        assert first is not None and last is not None
+        begin, end = (
+            self.place(part(t, side), part(x, side), rate) if rate.place is None else rate.place
+            for side, rate in (("a", first), ("b", last))
+        )
+        return begin, end
+
+    def place(self, t: Any, x: Tree, rate: Rate) -> Place:
+        """Return a point close to z, or to y − F(y)/L_F for a law that is iterated, whose solver may
+        return another z, with its projection and the switch functions there."""
+        K, space = self.set_at(t), self.problem.spaces(x)[1]
+        z = rate.z
+        if not self.direct:
+            F = self.problem.frozen(t, x, self.args)(rate.y)
+            z = jtu.tree_map(lambda y, force: y - force / jnp.asarray(self.L_F, y.dtype), rate.y, F)
+        is_box = K.intervals(z) is not None
+        switches = None if is_box else K.switches(z, space)
+        return jax.lax.stop_gradient(Place(z, K.project(z, space), switches))
 
     def _enclosed_response(
         self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
@@ -269,8 +285,8 @@ class Flow(eqx.Module):
                 lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
             )
         elif self.interpolated:
-            places = self._place(t.a, x, first), self._place(t.b, x, last)
-            y, apart = interpolated_projection(space, z, places)
+            places = self._places(t, x, first, last)
+            y, apart = interpolated_projection(K, space, z, places)
             y = widened(y, apart, space)
         else:
             y = by_its_rules(K, space, z)
@@ -339,10 +355,8 @@ def _by_loop(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:
     however many places of a step ask for it."""
     rate = flow._closed_form(t, x) if flow.direct else _solved(flow, t, x, guess)
     switches = flow.switch_parts(t, x, rate.z) if flow.keeps_switches else None
-    nearest = None
-    if flow.interpolated and not flow.direct:
-        nearest = flow.set_at(t).project(rate.z, flow.problem.spaces(x)[1])
-    return rate._replace(**jax.lax.stop_gradient({"switches": switches, "nearest": nearest}))
+    place = flow.place(t, x, rate) if flow.interpolated else None
+    return rate._replace(switches=jax.lax.stop_gradient(switches), place=place)
 
 
 def _solved(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Rate:

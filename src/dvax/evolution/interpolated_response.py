@@ -29,8 +29,17 @@ from .._tree import Tree
 from ..operators import AbstractOperator
 from ..problem import Problem
 from ..programs.enclosure import LinearEnclosure, enclose, is_enclosure, straight
+from ..sets import AbstractSet
 from ..spaces import AbstractSpace
-from .enclosed_projection import by_its_rules, gap, gap_of_box, is_polyhedral, part, rounding_of
+from .enclosed_projection import (
+    Gap,
+    by_its_rules,
+    gap,
+    gap_of_box,
+    is_polyhedral,
+    part,
+    rounding_of,
+)
 
 
 class Place(NamedTuple):
@@ -46,10 +55,12 @@ class InterpolatedResponse(NamedTuple):
     """The line between the responses at both ends of a step.
 
     - `u`: the line, as enclosures without a deviation;
-    - `residual`: ρ of the file's docstring, at all times of the step; ‖y − y*‖ ≤ ρ/γ."""
+    - `residual`: ρ of the file's docstring, at all times of the step; ‖y − y*‖ ≤ ρ/γ;
+    - `resolved`: ρ without roundoff, which does not decrease with the step."""
 
     u: Tree
     residual: jax.Array
+    resolved: jax.Array
 
 
 def interpolated(
@@ -76,7 +87,8 @@ def interpolated(
         of_F = enclose(lambda t, x, u, y: _step(y, law(t, x, u), L_F), t, x, u, straight(*y))
         R = enclose(_tree.sub, straight(*y), by_its_rules(K, space, of_F))
         largest = space.norm(jtu.tree_map(lambda q: q.largest, R, is_leaf=is_enclosure))
-        return InterpolatedResponse(u, (gamma + 2.0 * L_F) * largest)
+        rho = (gamma + 2.0 * L_F) * largest
+        return InterpolatedResponse(u, rho, rho)
     F = enclose(law, t, x, u)
     normals = [
         _normal(space, value, place)
@@ -84,34 +96,38 @@ def interpolated(
     ]
     v, stretch = (normals[0][0], normals[1][0]), jnp.maximum(normals[0][1], normals[1][1])
     if bounds is None:
-        rounding = rounding_of(space, *(place[:2] for place in places))
+        rounding = rounding_of(K, space, *(place[:2] for place in places))
         switches = places[0].switches, places[1].switches
         g = gap(space, y, v, switches, stretch, rounding)
     else:
-        g, rounding = gap_of_box(space, y, v, bounds), jnp.zeros_like(moved)
+        of_box = gap_of_box(space, y, v, bounds)
+        g, rounding = Gap(of_box, of_box), jnp.zeros_like(moved)
     ends = [space.norm(_tree.add(part(F, end), w)) for end, w in zip(("a", "b"), v, strict=True)]
-    r = jnp.maximum(*ends) + space.norm(part(F, "dev")) + L_F * moved + (L_F + stretch) * rounding
-    rho = 0.5 * (r + jnp.sqrt(jnp.square(r) + gamma * g))
-    return InterpolatedResponse(u, rho + gamma * (moved + rounding))
+    r = jnp.maximum(*ends) + space.norm(part(F, "dev")) + L_F * moved
+    rho, resolved = (
+        0.5 * (r + more + jnp.sqrt(jnp.square(r + more) + gamma * gap)) + gamma * moved
+        for more, gap in (((L_F + stretch) * rounding, g.bound), (0.0, g.resolved))
+    )
+    return InterpolatedResponse(u, rho + gamma * rounding, resolved)
 
 
 def interpolated_projection(
-    space: AbstractSpace, z: Tree, places: tuple[Place, Place]
+    K: AbstractSet, space: AbstractSpace, z: Tree, places: tuple[Place, Place]
 ) -> tuple[Tree, jax.Array]:
-    """Return the line between the projections at two places onto a polyhedral set, as enclosures, and
+    """Return the line between the projections onto a polyhedral set at two places, as enclosures, and
     a bound on the distance of the projection from it, for an enclosure of z.
 
     This is the law of F(y) = y − z."""
     y = places[0].y, places[1].y
     v = _tree.sub(places[0].z, y[0]), _tree.sub(places[1].z, y[1])
-    rounding = rounding_of(space, *(place[:2] for place in places))
+    rounding = rounding_of(K, space, *(place[:2] for place in places))
     g = gap(space, y, v, (places[0].switches, places[1].switches), 1.0, rounding)
     ends = [
         space.norm(_tree.sub(part(z, end), place.z))
         for end, place in zip(("a", "b"), places, strict=True)
     ]
     r = jnp.maximum(*ends) + space.norm(part(z, "dev")) + 2.0 * rounding
-    return straight(*y), 0.5 * (r + jnp.sqrt(jnp.square(r) + g)) + rounding
+    return straight(*y), 0.5 * (r + jnp.sqrt(jnp.square(r) + g.bound)) + rounding
 
 
 def _step(y: Tree, F: Tree, L_F: Any) -> Tree:

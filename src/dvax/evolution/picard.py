@@ -8,7 +8,6 @@ order 2. The defect p − f̃(·, x_h) measures the distance of the iterate from
 sampled, or enclosed, as for the other methods.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -358,7 +357,6 @@ def solve_by_windows(
     """Solve by `Picard` from the first stop to the last."""
     x0 = setup.x0
     growth = flow.generator.growth(flow.state_space(x0)) if flow.enclosed else None
-    flow = dataclasses.replace(flow, keeps_switches=flow.iterates and flow.interpolated)
     ends = stops[0], stops[-1]
     stepper = Stepper(
         ETD2RK(), flow, True, False, None, options.track_bounds, True, False, ends, None, growth

@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._jax.jaxprs import has_loop
 from ..programs.enclosure import constant, has_enclosure
+from ..sets._library import is_of_library
 from ..vi import AbstractSolver, Auto, analyse, independent
 from .enclosed_projection import is_polyhedral
 from .flow import Flow, Rate, slope
@@ -125,12 +126,14 @@ def _is_enclosed(setup: Setup, plan: Plan) -> bool:
     is_box = K.intervals(like) is not None
     data = lambda t: jtu.tree_leaves(problem.set_at(t, args))  # noqa: E731
     # Without moduli nothing is certified, and a defect that is sampled allows longer steps.
-    if not is_box and not (setup.moduli and independent(data, t0)):
+    # Another set may hold a function that uses t.
+    is_fixed = is_of_library(K) and independent(data, t0)
+    if not is_box and not (setup.moduli and is_fixed):
         return False
     if plan.closed_form and plan.interpolated and (is_box or not is_polyhedral(K)):
         return False
     zero = jnp.zeros((), _tree.dtype(x0))
-    rate = Rate(x0, like, like, zero, zero > 0, jnp.asarray(0), None, like)
+    rate = Rate(x0, like, like, zero, zero > 0, jnp.asarray(0))
     flow = plan.flow(setup)
     enclosure = lambda t, x: flow.enclosure(constant(t), constant(x), rate, rate)  # noqa: E731
     return has_enclosure(enclosure, t0, x0)

@@ -159,8 +159,7 @@ def _stepper(
         pointwise = is_pointwise(flow.problem, flow.operator, t0, setup.x0, flow.args)
         flow = dataclasses.replace(flow, pointwise=pointwise)
     locate = not options.fixed and _can_locate(flow, t0, setup.x0)
-    keeps_switches = flow.iterates and (locate or flow.interpolated)
-    flow = dataclasses.replace(flow, keeps_switches=keeps_switches)
+    flow = dataclasses.replace(flow, keeps_switches=locate and flow.iterates)
     watch = not options.fixed and measure and not flow.enclosed
     guard = excursions.guard(flow, t0, setup.x0) if watch else None
     stepper = Stepper(

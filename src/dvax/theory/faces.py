@@ -22,8 +22,9 @@ from ..programs.slope import Values
 from ..sets._conditions import Conditions
 from .blocks import Block
 
-_RANK = 1e-6
-"""Smallest singular value of independent rows of length one."""
+_RANK, _ZERO = 1e-6, 1e-14
+"""Smallest singular value of rows of length one that count as independent, and largest one of rows that
+count as dependent. In between D is not known."""
 
 _ROUNDINGS = 64.0
 """Roundings of the entries of D, of R y and of μ."""
@@ -81,10 +82,11 @@ def _derivative(
         size = np.maximum(np.abs(force.low), np.abs(force.high))
         half = half + _ROUNDINGS * eps * np.linalg.norm(size) / _RANK
         certain |= np.abs(mu) > half
-    inner, outer = _null_space(rows, 1e-12), _null_space(rows[certain], _RANK)
-    if certain.all():
+    inner, outer = _null_space(rows, _ZERO), _null_space(rows[certain], _RANK)
+    part = np.maximum(np.diag(outer - inner), 0.0)
+    if part.sum() < 0.5:  # the rank of Π
         return outer, rounding, True
-    d = np.sqrt(np.maximum(np.diag(outer - inner), 0.0))
+    d = np.sqrt(part)
     return 0.5 * (inner + outer), 0.5 * np.outer(d, d) + rounding, False
 
 
