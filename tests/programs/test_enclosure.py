@@ -1,5 +1,6 @@
 """Linear enclosures: a function of time stays within the bound on its distance from a line."""
 
+import contextlib
 import functools
 
 import jax
@@ -12,7 +13,14 @@ from tests.hard_rates import RATES
 from tests.selection import mostly_thorough
 
 import dvax
-from dvax.programs.enclosure import LinearEnclosure, NoEnclosure, constant, enclose, straight
+from dvax.programs.enclosure import (
+    LinearEnclosure,
+    NoEnclosure,
+    below_parabola,
+    constant,
+    enclose,
+    straight,
+)
 
 TABLE = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0])
 STAIRS = dvax.signals.Table([0.0, 1.0, 2.5, 4.0], [0.0, 3.0, -1.0, 2.0], kind="constant")
@@ -242,3 +250,20 @@ def test_enclosure_of_constants_has_no_deviation():
         LinearEnclosure(*map(jnp.asarray, (0.0, 1.0, 0.5))),
     )
     assert (float(line.a), float(line.b), float(line.dev)) == (9.0, 10.0, 0.5)
+
+
+@pytest.mark.parametrize("power", [1.1, 1.5, 1.9])
+@pytest.mark.parametrize(("a", "b"), [(-0.3, 0.7), (0.0, 0.5), (-1e-6, 1e-3), (1e-9, 2.0)])
+def test_function_of_infinite_curvature_is_enclosed_by_its_slope(power, a, b):
+    """|s|^p with 1 < p < 2 next to its zero, which has a slope and no second derivative."""
+    fn = lambda s: jnp.abs(s) ** power  # noqa: E731
+    theta = np.linspace(0.0, 1.0, 401)
+    for context in (contextlib.nullcontext(), below_parabola()):
+        with context:
+            q = enclose(fn, straight(jnp.asarray(a), jnp.asarray(b)))
+        values = np.abs((1 - theta) * a + theta * b) ** power
+        away = np.abs(values - ((1 - theta) * float(q.a) + theta * float(q.b)))
+        assert (away <= float(q.dev) + 1e-15).all()
+        # Half of it for |s|, and half of it for the power.
+        assert float(q.dev) <= 2.0 * power * max(abs(a), abs(b)) ** (power - 1) * (b - a)
+    assert (away <= 4.0 * theta * (1 - theta) * float(q.dev) + 1e-15).all()

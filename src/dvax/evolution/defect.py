@@ -79,7 +79,7 @@ def enclosed(
     (the norm of their mean would be too little: ends may lie in different entries). δ(0) is
     rounding, unless data jumps where nobody said it would. The step lies between the times `ends`.
 
-    Where an entry has no bound, as next to the zero of |s|^1.5, the defect is infinite, and so is what
+    Where an entry has no bound, as next to the zero of √s, the defect is infinite, and so is what
     it certifies; in a step that is short in a run of this `span` the step control goes by how far f̃
     moves from one end to the other.
 

@@ -6,7 +6,7 @@ and a bound |q(θ) − ((1−θ)a + θb)| ≤ dev for all θ in [0, 1]. Each ope
     sum          the deviations add
     product      |q r − line| ≤ |q| dev_r + |r| dev_q + dev_q dev_r + |Δq Δr|/4
     max, min     the larger deviation, plus |d₀d₁|/(|d₀| + |d₁|) at a crossing, d the difference
-    smooth φ     sup|φ′| dev + sup|φ″| Δ²/8 over the range of the argument
+    smooth φ     sup|φ′| dev + min(sup|φ″| Δ²/8, sup|φ′| |Δ|/2) over the range of the argument
 
 The deviation is O(h²) for smooth functions and O(h) with a kink in the step, and it is always an upper
 bound. An operation without a rule raises `NoEnclosure`; the defect is then sampled, and called
@@ -184,7 +184,9 @@ def _safe(factor: jax.Array, dev: jax.Array) -> jax.Array:
 def _composed(x: LinearEnclosure, phi: Callable, bounds: Bounds) -> LinearEnclosure:
     """Return the enclosure of φ(x), from bounds on |φ′| and |φ″| over the range of x."""
     slope, curvature = bounds(x.lowest, x.highest)
-    dev = _safe(slope, x.dev) + _safe(curvature, (x.b - x.a) ** 2 / 8)
+    # A chord of a function of slope m is at most 2θ(1 − θ)m|Δ| away from it.
+    bend = jnp.minimum(_safe(curvature, (x.b - x.a) ** 2 / 8), _safe(slope, jnp.abs(x.b - x.a) / 2))
+    dev = _safe(slope, x.dev) + bend
     return LinearEnclosure(phi(x.a), phi(x.b), dev)
 
 
