@@ -41,6 +41,9 @@ from .enclosed_projection import (
     rounding_of,
 )
 
+_ROUNDINGS = 8.0
+"""Relative roundoff of the terms of F, in units of ε."""
+
 
 class Place(NamedTuple):
     """An end of a step: z, its projection y onto K, and the switch functions of K at z where they are
@@ -83,13 +86,15 @@ def interpolated(
     y = places[0].y, places[1].y
     u = straight(*map(P.inverse, y))
     law = lambda t, x, u: _tree.sub(u, problem.h(t, x, u, args))  # noqa: E731
-    if bounds is None and not is_polyhedral(K):
-        of_F = enclose(lambda t, x, u, y: _step(y, law(t, x, u), L_F), t, x, u, straight(*y))
-        R = enclose(_tree.sub, straight(*y), by_its_rules(K, space, of_F))
-        largest = space.norm(jtu.tree_map(lambda q: q.largest, R, is_leaf=is_enclosure))
-        rho = (gamma + 2.0 * L_F) * largest
-        return InterpolatedResponse(u, rho, rho)
     F = enclose(law, t, x, u)
+    terms = [2.0 * space.norm(part(u, end)) + space.norm(part(F, end)) for end in ("a", "b")]
+    roundoff = _ROUNDINGS * jnp.finfo(terms[0].dtype).eps * jnp.maximum(*terms)  # of F
+    if bounds is None and not is_polyhedral(K):
+        stepped = enclose(lambda y, F: _step(y, F, L_F), straight(*y), F)
+        R = enclose(_tree.sub, straight(*y), by_its_rules(K, space, stepped))
+        largest = space.norm(jtu.tree_map(lambda q: q.largest, R, is_leaf=is_enclosure))
+        scale = gamma + 2.0 * L_F
+        return InterpolatedResponse(u, scale * (largest + roundoff / L_F), scale * largest)
     normals = [
         _normal(space, value, place)
         for value, place in zip((part(F, "a"), part(F, "b")), places, strict=True)
@@ -106,7 +111,7 @@ def interpolated(
     r = jnp.maximum(*ends) + space.norm(part(F, "dev")) + L_F * moved
     rho, resolved = (
         0.5 * (r + more + jnp.sqrt(jnp.square(r + more) + gamma * gap)) + gamma * moved
-        for more, gap in (((L_F + stretch) * rounding, g.bound), (0.0, g.resolved))
+        for more, gap in (((L_F + stretch) * rounding + roundoff, g.bound), (0.0, g.resolved))
     )
     return InterpolatedResponse(u, rho + gamma * rounding, resolved)
 
