@@ -116,7 +116,7 @@ def test_kinks_of_a_coupled_law_are_passed_in_single_precision_in_as_many_steps(
 def half_space():
     return dvax.Problem(
         A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0),
-        K=lambda t, a: dvax.sets.HalfSpace(a["g"], jnp.asarray(0.5, a["g"].dtype)),
+        K=lambda t, a: dvax.sets.HalfSpace(a["g"], a["b"]),
         control_space=dvax.spaces.Euclidean((3,)), f=lambda t, x, u, a: a["v"],
         h=lambda t, x, u, a: a["C"] @ x + a["D"] @ u,
     )  # fmt: skip
@@ -130,7 +130,7 @@ def test_iterated_law_is_solved_where_its_operator_is_roundoff(dtype):
         rng = np.random.default_rng(seed)
         D = rng.normal(size=(3, 3))
         a = dict(C=rng.normal(size=(3, 3)), D=0.6 * D / np.linalg.norm(D, 2), g=rng.normal(size=3),
-                 v=rng.normal(size=3))  # fmt: skip
+                 v=rng.normal(size=3), b=0.5)  # fmt: skip
         a = {name: np.asarray(value, dtype) for name, value in a.items()}
         x0 = np.asarray(100.0 * rng.normal(size=3), dtype)
         rtol = 1e-4 if dtype is np.float32 else 1e-12
