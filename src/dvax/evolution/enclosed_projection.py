@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 
 from .. import _tree
 from .._tree import Tree
-from ..programs.enclosure import LinearEnclosure, constant, enclose, has_enclosure, is_enclosure
+from ..programs.enclosure import LinearEnclosure, enclose, is_enclosure
 from ..sets import (
     AbstractSet,
     Ball,
@@ -52,12 +52,6 @@ def is_polyhedral(K: AbstractSet) -> bool:
     return is_of_library(K) and not any(isinstance(s, _NOT_POLYHEDRAL) for s in sets_in(K))
 
 
-def has_rules(K: AbstractSet, space: AbstractSpace, like: Tree) -> bool:
-    """Return whether the projection onto K has an enclosure by rules."""
-    by_rules = lambda z: by_its_rules(K, space, constant(z))  # noqa: E731
-    return not isinstance(K, Intersection) and has_enclosure(by_rules, like)
-
-
 def by_its_rules(K: AbstractSet, space: AbstractSpace, z: Tree) -> Tree:
     """Return the enclosure of proj_K(z) for an enclosure of z.
 
@@ -70,7 +64,7 @@ def by_its_rules(K: AbstractSet, space: AbstractSpace, z: Tree) -> Tree:
 
 
 def widened(enclosures: Tree, by: Any, space: AbstractSpace, join: Any = jnp.add) -> Tree:
-    """Return enclosures with their deviations joined to the largest entries of elements of a norm."""
+    """Return enclosures with their deviations joined to the largest entry of elements of norm `by`."""
 
     def one(q: LinearEnclosure, w: jax.Array) -> LinearEnclosure:
         largest = (by / jnp.sqrt(w)).astype(q.dev.dtype)
@@ -99,7 +93,7 @@ def rounding_of(K: AbstractSet, space: AbstractSpace, *pairs: tuple[Tree, Tree])
 def gap(
     space: AbstractSpace, y: tuple[Tree, Tree], v: tuple[Tree, Tree],
     switches: tuple[list[jax.Array] | None, list[jax.Array] | None], stretch: Any, rounding: Any,
-) -> "Gap":  # fmt: skip
+) -> Gap:  # fmt: skip
     """Return g for v = σ(z − y) with σ up to `stretch`, and y up to `rounding`; 0 for the same active
     constraints, at which no switch function changes its sign."""
     of_y, of_v = _tree.sub(y[1], y[0]), _tree.sub(v[1], v[0])

@@ -256,8 +256,8 @@ class Flow(eqx.Module):
         return begin, end
 
     def place(self, t: Any, x: Tree, rate: Rate) -> Place:
-        """Return a point close to z, or to y − F(y)/L_F for a law that is iterated, whose solver may
-        return another z, with its projection and the switch functions there."""
+        """Return z of a closed form, or y − F(y)/L_F where the law is iterated, since solvers return
+        other z; with its projection and the switch functions there."""
         K, space = self.set_at(t), self.problem.spaces(x)[1]
         z = rate.z
         if not self.direct:
