@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
+import scipy.linalg
 
 from .._tree import Tree
 from .abstract import AbstractSet
@@ -102,14 +103,8 @@ def _joined(*parts: Conditions) -> Conditions:
 
 
 def _product(parts: list[Conditions]) -> Conditions:
-    sizes = [part.R.shape[1] for part in parts]
-    starts = np.cumsum([0, *sizes])
-    rows = [
-        np.pad(part.R, ((0, 0), (start, starts[-1] - start - size)))
-        for part, start, size in zip(parts, starts, sizes, strict=False)
-    ]
     return Conditions(
-        np.concatenate(rows),
+        scipy.linalg.block_diag(*(part.R for part in parts)),
         np.concatenate([part.low for part in parts]),
         np.concatenate([part.high for part in parts]),
     )
