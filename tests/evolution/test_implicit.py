@@ -144,3 +144,23 @@ def test_knots_outside_of_the_run_change_nothing(solver):
     for b, slope in ((2.0001, 0.3), (9.0, 0.3), (1e9, 0.3), (-1e-3, 0.4), (-9.0, 0.4)):
         found = jax.value_and_grad(end)(2.0, b)
         np.testing.assert_allclose(found, [0.4 + 2.0 * slope, slope], atol=1e-6)
+
+
+def test_derivatives_in_the_ends_of_a_run_over_kinks_are_those_of_the_flow():
+    # The solution x(t₁; t₀, x₀) has ∂x/∂t₁ = x'(t₁) and ∂x/∂t₀ = −∂x/∂x₀ x'(t₀), at any tolerance.
+    def rate(t, x):
+        return 1.0 - x + jnp.sin(3.0 * t) * jnp.clip(-8.0 * (x - 1.2 * jnp.sin(3.0 * t)), 0.0, 9.0)
+
+    problem = dvax.Problem(
+        A=generators.Zero(), P=PLAIN, K=dvax.sets.Box(0.0, 9.0),
+        f=lambda t, x, u, args: 1.0 - x + jnp.sin(3.0 * t) * u,
+        h=lambda t, x, u, args: -16.0 * (x - 1.2 * jnp.sin(3.0 * t)) - u,
+    )  # fmt: skip
+
+    def end(x0, t0, t1):
+        return dvax.solve(problem, x0, t0, t1, rtol=1e-4, method=dvax.Implicit()).xs[-1]
+
+    for at in ((0.4, 0.1, 2.3), (0.4, 0.1, 1.7), (0.9, 0.6, 2.3)):
+        x1, (by_x0, by_t0, by_t1) = jax.value_and_grad(end, (0, 1, 2))(*at)
+        np.testing.assert_allclose(by_t1, rate(at[2], x1), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(by_t0, -by_x0 * rate(at[1], at[0]), rtol=1e-6, atol=1e-9)

@@ -14,7 +14,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import input_error
 from .flow import Flow
-from .outcome import Outcome, Saved
+from .outcome import Outcome, Saved, with_tangents
 from .results import RESULTS
 from .setup import Options, Setup
 from .stepper import one_sided_time
@@ -81,8 +81,13 @@ def solve_by_implicit_steps(
     options: Options,
 ) -> Outcome:
     """Solve by `Implicit` from the first stop to the last."""
-    clock, x0, first_step = _Clock(stops), setup.x0, setup.number("dt0")
-    start, end = clock.stops[0], clock.stops[-1]
+    # The tangents of the ends enter through x' there, which is exact: a clock that stretched the first
+    # and the last piece would differentiate the steps over kinks inside them.
+    start, end = lax.stop_gradient((stops[0], stops[-1]))
+    clock = _Clock(stops.at[0].set(start).at[-1].set(end))
+    first_step = lax.stop_gradient(setup.number("dt0"))
+    given = lax.stop_gradient(setup.x0), flow, (start, end)
+    x0 = _from_start(setup.x0, stops[0], given)
     rtol, atol = setup.number("rtol"), setup.number("atol")
     first, last = (one_sided_time(start, end, theta, (start, end)) for theta in (0.0, 1.0))
 
@@ -108,7 +113,7 @@ def solve_by_implicit_steps(
         end,
         first_step,
         x0,
-        saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=clock.inverse(ts)),
+        saveat=diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=lax.stop_gradient(ts)),
         stepsize_controller=_controller(rtol, atol, clock.stops),
         adjoint=diffrax.ForwardMode()
         if options.adjoint == "forward"
@@ -131,18 +136,27 @@ def solve_by_implicit_steps(
     is_out_of_steps = solution.result == diffrax.RESULTS.max_steps_reached
     result = RESULTS.where(is_out_of_steps, RESULTS.max_steps, RESULTS.implicit_unsolved)
     result = RESULTS.where(is_successful, RESULTS.successful, result)
-    times = jnp.where(reached, stops[-1:] if ts is None else ts, jnp.inf)
+    times = stops[-1:] if ts is None else ts
+    passed = jax.vmap(lambda s: clock.time(s)[0])(lax.stop_gradient(times))
+    rows = with_tangents(Saved(jnp.where(reached, passed, jnp.inf), xs), times, *given)
     # Of a failed run, report the last saved time that it reached.
     count = jnp.sum(reached)
     row = jnp.maximum(count - 1, 0)
     stats = {
         "steps": solution.stats["num_accepted_steps"],
         "rejected": solution.stats["num_rejected_steps"],
-        "t": jnp.where(count > 0, times[row], start),
-        "x": jtu.tree_map(lambda leaf, x: jnp.where(count > 0, leaf[row], x), xs, x0),
+        "t": jnp.where(count > 0, rows.t[row], start),
+        "x": jtu.tree_map(lambda leaf, x: jnp.where(count > 0, leaf[row], x), rows.x, x0),
         "next_dt": first_step,
     }
-    return Outcome(Saved(times, xs), stats, result, None)
+    return Outcome(rows, stats, result, None)
+
+
+def _from_start(x0: Tree, t0: Any, given: tuple[Any, ...]) -> Tree:
+    """Return x0 as the state at a constant t0, whose tangent is −x'(t0) times that of t0."""
+    row = Saved(t0[None], jtu.tree_map(lambda leaf: leaf[None], x0))
+    row = with_tangents(row, lax.stop_gradient(row.t), *given)
+    return jtu.tree_map(lambda leaf: leaf[0], row.x)
 
 
 class _Clock:
@@ -165,11 +179,6 @@ class _Clock:
         """Return t and dt/ds."""
         shift, slope = self._at(s)
         return s + (shift + slope * s), 1.0 + slope
-
-    def inverse(self, t: Any) -> Any:
-        """Return s."""
-        shift, slope = self._at(lax.stop_gradient(t))
-        return (t - shift) / (1.0 + slope)
 
     def _at(self, s: Any) -> tuple[Any, Any]:
         piece = jnp.searchsorted(self.stops[1:-1], s, side="left")
