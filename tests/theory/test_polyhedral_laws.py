@@ -16,8 +16,10 @@ import dvax
 from dvax import sets
 from dvax.evolution.enclosed_projection import by_its_rules
 from dvax.evolution.interpolated_response import Place, interpolated, interpolated_projection
+from dvax.evolution.moving_set import Motion
 from dvax.programs.enclosure import LinearEnclosure, constant, straight
 from dvax.sets._conditions import conditions
+from dvax.sets._face import face
 from dvax.theory.faces import Range, derivatives_on_faces
 
 N = 4
@@ -57,12 +59,15 @@ CURVED = {
 }
 
 
+NO_MOTION = Motion(jnp.zeros(()), jnp.zeros(()))
+
+
 @once
 def placed():
-    """Compiled programs of sets: y and the switch functions at z."""
+    """Compiled programs of sets: y and the face at z."""
 
     def place(K, space, z):
-        return Place(z, K.project(z, space), K.switches(z, space))
+        return Place(z, K.project(z, space), face(K, z, space))
 
     return jax.jit(place)
 
@@ -78,7 +83,7 @@ def test_projection_of_a_line_stays_near_the_line_between_its_ends(name):
         a = jnp.asarray(rng.normal(size=N))
         b = a + 10.0 ** rng.uniform(-5, 0.5) * rng.normal(size=N)
         line, apart = enclosed(
-            K, space, straight(a, b), (placed()(K, space, a), placed()(K, space, b))
+            K, space, straight(a, b), (placed()(K, space, a), placed()(K, space, b)), jnp.zeros(())
         )
         thetas = np.linspace(0.0, 1.0, 33)[:, None]
         on = lambda p, q, thetas=thetas: (1 - thetas) * np.asarray(p) + thetas * np.asarray(q)  # noqa: E731
@@ -97,7 +102,15 @@ def test_projection_onto_a_curved_set_is_enclosed_on_both_sides_and_over_the_kin
     K, smooth = CURVED[name](rng), 0
     # The projection onto a cone in a weighted space finds a root, and has no rules.
     for space in (EUCLIDEAN,) if name == "cone" else (EUCLIDEAN, WEIGHTED):
-        enclosed = jax.jit(lambda a, b, space=space: by_its_rules(K, space, straight(a, b)))
+        problem = dvax.Problem(
+            A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=K, control_space=space,
+            f=lambda t, x, u, args: u, h=lambda t, x, u, args: x,
+        )  # fmt: skip
+        enclosed = jax.jit(
+            lambda a, b, space=space, problem=problem: by_its_rules(
+                problem, None, space, constant(jnp.zeros(())), straight(a, b), NO_MOTION
+            )
+        )
         project = jax.jit(jax.vmap(lambda z, space=space: K.project(z, space)))
         for _ in range(60):
             a, length = rng.normal(size=N), 10.0 ** rng.uniform(-4, 0.5)

@@ -26,6 +26,7 @@ from ..programs.enclosure import (
 from ..programs.partial_evaluation import PartialEvaluation
 from ..programs.structure import analyse
 from ..sets import AbstractSet, Polyhedron
+from ..sets._face import face
 from ..sets._library import is_of_library
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
@@ -34,6 +35,7 @@ from .enclosed_projection import by_its_rules, part, widened
 from .interpolated_response import Place, interpolated, interpolated_projection
 from .law_tolerance import LawTolerance
 from .linearised import AbstractLinear, finite, linearise
+from .moving_set import motion
 from .small_box import AbstractSmallBox
 
 _SMALL = 400
@@ -257,15 +259,15 @@ class Flow(eqx.Module):
 
     def place(self, t: Any, x: Tree, rate: Rate) -> Place:
         """Return z of a closed form, or y − F(y)/L_F where the law is iterated, since solvers return
-        other z; with its projection and the switch functions there."""
+        other z; with its projection and the face of K there."""
         K, space = self.set_at(t), self.problem.spaces(x)[1]
         z = rate.z
         if not self.direct:
             F = self.problem.frozen(t, x, self.args)(rate.y)
             z = jtu.tree_map(lambda y, force: y - force / jnp.asarray(self.L_F, y.dtype), rate.y, F)
-        is_box = K.intervals(z) is not None
-        switches = None if is_box else K.switches(z, space)
-        return jax.lax.stop_gradient(Place(z, K.project(z, space), switches))
+        found = face(K, z, space)
+        y = K.project(z, space) if found is None else found.y
+        return jax.lax.stop_gradient(Place(z, y, found))
 
     def _enclosed_response(
         self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
@@ -285,11 +287,13 @@ class Flow(eqx.Module):
                 lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
             )
         elif self.interpolated:
+            moves = motion(problem, args, t, zero, space)
             places = self._places(t, x, first, last)
-            y, apart = interpolated_projection(K, space, z, places)
+            y, apart = interpolated_projection(K, space, z, places, moves.deviation)
             y = widened(y, apart, space)
         else:
-            y = by_its_rules(K, space, z)
+            moves = motion(problem, args, t, zero, space)
+            y = by_its_rules(problem, args, space, t, z, moves)
         return enclose(self.operator.inverse, y)
 
     def switches_of(self, t: Any, x: Tree, rate: Rate) -> list[jax.Array] | None:

@@ -9,14 +9,14 @@ import jax.tree_util as jtu
 from .. import _tree
 from .._jax.jaxprs import has_loop
 from ..programs.enclosure import constant, has_enclosure
-from ..sets._library import is_of_library
+from ..sets._face import is_polyhedral
 from ..vi import AbstractSolver, Auto, analyse, independent
-from .enclosed_projection import is_polyhedral
 from .flow import Flow, Rate, slope
 from .implicit import Implicit
 from .law_tolerance import law_tolerance
 from .linearised import NoJacobian
 from .method import AbstractMethod
+from .moving_set import has_bounded_motion
 from .setup import Setup
 from .small_box import AbstractSmallBox, is_small, small_box
 
@@ -116,21 +116,20 @@ class Plan(NamedTuple):
 
 
 def _is_enclosed(setup: Setup, plan: Plan) -> bool:
-    """Return whether f̃ has an enclosure over a step in the way of a plan: its operations have rules, K
-    is a box or does not move, and the moduli of a law without closed form are known."""
+    """Return whether f̃ has an enclosure over a step in the way of a plan: its operations have rules,
+    the motion of K has a bound, and the moduli of a law without closed form are known."""
     problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
     if not plan.closed_form and not _MODULI <= set(setup.moduli):
         return False
     args, like = _tree.as_arrays(setup.args), problem.zero_control(x0)
     K = problem.set_at(t0, args)
     is_box = K.intervals(like) is not None
-    data = lambda t: jtu.tree_leaves(problem.set_at(t, args))  # noqa: E731
     # Without moduli nothing is certified, and a defect that is sampled allows longer steps.
-    # Another set may hold a function that uses t.
-    is_fixed = is_of_library(K) and independent(data, t0)
-    if not is_box and not (setup.moduli and is_fixed):
+    if not is_box and not setup.moduli:
         return False
     if plan.closed_form and plan.interpolated and (is_box or not is_polyhedral(K)):
+        return False
+    if not has_bounded_motion(problem, args, t0, like, problem.spaces(x0)[1]):
         return False
     zero = jnp.zeros((), _tree.dtype(x0))
     rate = Rate(x0, like, like, zero, zero > 0, jnp.asarray(0))

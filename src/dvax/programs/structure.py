@@ -113,6 +113,25 @@ def independent_of_first(fn: Callable[..., Tree], first: Tree, *others: Tree) ->
     return all(out.degree == 0 for out in _read(program, inputs))
 
 
+def affine_between_knots(fn: Callable[[Any], Tree], t: Any) -> bool:
+    """Return whether the code of `fn` proves that fn(t) is affine in t between the times of the
+    constant and linear `dvax.signals.Table` in it.
+
+    ```python
+    >>> import dvax, jax.numpy as jnp
+    >>> from dvax.programs.structure import affine_between_knots
+    >>> load = dvax.signals.Table(jnp.array([0.0, 1.0, 2.0]), jnp.array([3.0, 5.0, 4.0]))
+    >>> affine_between_knots(lambda t: 2.0 * load(t) + t, 0.0)
+    True
+    >>> affine_between_knots(lambda t: load(t) ** 2, 0.0)
+    False
+
+    ```
+    """
+    results = interpret(jax.make_jaxpr(fn)(t), [_Dependence(1, None, False)], _BETWEEN_KNOTS)
+    return all(out.degree <= 1 for out in map(_lift, results))
+
+
 def _read(program: Any, inputs: list[_Dependence]) -> list[_Dependence]:
     return list(map(_lift, interpret(program, inputs, _DOMAIN)))
 
@@ -283,4 +302,14 @@ _DOMAIN = Domain(
     unknown=lambda eqn, operands: [_general(eqn, operands)] * len(eqn.outvars),
     apply=_apply,
     evaluate=_constant,
+)
+
+
+def _table(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+    *data, t = operands
+    return _Dependence(2 if any(v.degree for v in data) else t.degree, None, False)
+
+
+_BETWEEN_KNOTS = _DOMAIN._replace(
+    rules={**RULES, **same_for({"dvax_constant_table", "dvax_linear_table"}, _table)}
 )

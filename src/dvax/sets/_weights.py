@@ -1,5 +1,7 @@
 """The weights of a space's diagonal inner product, in the form that the projections use."""
 
+import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
@@ -23,3 +25,13 @@ def inverse_weights(space: AbstractSpace, like: Tree) -> Tree:
         return jnp.broadcast_to(1.0 / w, jnp.shape(leaf))
 
     return jtu.tree_map(one, like, space.weights())
+
+
+def full_weights(space: AbstractSpace, like: Tree) -> Tree:
+    """Return wᵢ, shaped like an element."""
+    return jtu.tree_map(lambda leaf, w: jnp.broadcast_to(w, leaf.shape), like, space.weights())
+
+
+def flat_roots(space: AbstractSpace, like: Tree) -> jax.Array:
+    """Return √wᵢ as one vector."""
+    return jnp.sqrt(jax.flatten_util.ravel_pytree(full_weights(space, like))[0])

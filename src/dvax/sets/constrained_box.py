@@ -144,6 +144,25 @@ class ConstrainedBox(AbstractSet):
             )
 
 
+def bounds_and_rows(
+    K: ConstrainedBox, z: jax.Array, space: AbstractSpace
+) -> tuple[jax.Array, jax.Array, tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    """Return the projection y, the normal v there, and the multipliers and slacks of the upper and the
+    lower bounds and of both ends of the rows."""
+    z, inverse_w, lower, upper, R, low, high = data = K._data(z, space)
+    y, mu, _, shifted = _nearest(*data)
+    beyond, sums = shifted - y, times(R, y)  # normal to the box
+    multipliers = tuple(
+        jnp.maximum(sign * a, 0.0) for a in (beyond / inverse_w, mu) for sign in (1.0, -1.0)
+    )
+    of_rows = []
+    for is_active, slack in ((mu > 0.0, high - sums), (mu < 0.0, sums - low)):
+        is_held = is_active | (low == high) | (slack <= _tolerance(y, R, low, high))
+        of_rows.append(jnp.where(is_held, 0.0, slack))
+    slacks = upper - y, y - lower, *of_rows
+    return y, beyond + inverse_w * combine(mu, R), multipliers, slacks
+
+
 class _State(NamedTuple):
     """Multipliers, z − W⁻¹Rᵀμ, y and R y there, the added row (−1: none), and whether the iteration is
     over.

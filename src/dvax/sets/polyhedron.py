@@ -106,10 +106,8 @@ class Polyhedron(AbstractSet):
 
         The multipliers of linearly dependent rows are not unique. A row without a bound has the
         slack 1."""
-        reduced = self._reduced(z, space)
-        y, active, multiplier, _ = _nearest(z.reshape(-1), *reduced)
-        slack = reduced.bounds - times(reduced.rows, y / reduced.root - reduced.base)
-        return [jnp.where(active > 0, -multiplier, slack)]
+        _, is_active, multiplier, slack = rows_at(self, z, space)
+        return [jnp.where(is_active, -multiplier, slack)]
 
     def _reduced(self, z: Tree, space: AbstractSpace) -> "_Reduced":
         return self._reduce(z, space) if self.reduced is None else self.reduced
@@ -124,6 +122,15 @@ class Polyhedron(AbstractSet):
 
     def check(self, like: Tree) -> None:
         check_row_shapes("dvax.sets.Polyhedron(G)", self.G, like)
+
+
+def rows_at(K: Polyhedron, z: jax.Array, space: AbstractSpace) -> tuple[jax.Array, ...]:
+    """Return the projection of z and, for each row of G, whether it is active, its multiplier and its
+    slack there. The rows have length one, without the part that the equations determine."""
+    reduced = K._reduced(z, space)
+    y, active, multiplier, _ = _nearest(z.reshape(-1), *reduced)
+    slack = reduced.bounds - times(reduced.rows, y / reduced.root - reduced.base)
+    return y.reshape(z.shape), active > 0, multiplier, slack
 
 
 class _Reduced(NamedTuple):

@@ -48,17 +48,17 @@ class Translated(AbstractSet):
         )
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
-        offset = self._broadcast(z)
+        offset = full_offset(self, z)
         return _tree.add(offset, self.set.project(_tree.sub(z, offset), space))
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
-        return self.set.switches(_tree.sub(z, self._broadcast(z)), space)
+        return self.set.switches(_tree.sub(z, full_offset(self, z)), space)
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         inner = self.set.intervals(like)
         if inner is None:
             return None
-        offset = self._broadcast(like)
+        offset = full_offset(self, like)
         return _tree.add(inner[0], offset), _tree.add(inner[1], offset)
 
     def check(self, like: Tree) -> None:
@@ -71,10 +71,12 @@ class Translated(AbstractSet):
             )
         self.set.check(like)
 
-    def _broadcast(self, like: Tree) -> Tree:
-        if _is_number(self.offset):
-            return jtu.tree_map(lambda leaf: jnp.broadcast_to(self.offset, leaf.shape), like)
-        return self.offset
+
+def full_offset(K: Translated, like: Tree) -> Tree:
+    """Return the offset, shaped like an element."""
+    if _is_number(K.offset):
+        return jtu.tree_map(lambda leaf: jnp.broadcast_to(K.offset, leaf.shape), like)
+    return K.offset
 
 
 def _is_number(offset: Tree) -> bool:

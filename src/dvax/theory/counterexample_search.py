@@ -14,10 +14,10 @@ from .. import _tree
 from .._tree import Tree
 from ..programs.derivatives_of_operations import has_derivative
 from ..programs.slope import is_slope
+from ..sets._weights import flat_roots, full_weights
 from ..spaces import AbstractSpace
 from .region import Region
 from .system import System
-from .weights import flat_roots, full_weights
 
 _STARTS, _ASCENT_STEPS = 256, 60
 """Number of starting points of a search, and of ascent steps from each."""

@@ -11,11 +11,11 @@ import numpy as np
 
 from .._tree import Tree
 from ..programs.derivatives_of_operations import has_derivative
+from ..sets._weights import flat_roots
 from ..spaces import AbstractSpace
 from ..vi import analyse, independent
 from .lanczos import largest_eigenvalue_bound
 from .system import System
-from .weights import flat_roots
 
 
 def in_euclidean_coordinates(

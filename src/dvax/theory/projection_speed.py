@@ -1,130 +1,14 @@
-"""Bounds on the speed of the projection onto K(t), by the kind of the set.
+"""Bounds on the speed of the projection onto K(t): ‖proj_{K(s)}z − proj_{K(t)}z‖ ≤ speed |s − t| for
+every z."""
 
-They hold for every z: ‖proj_{K(s)}z − proj_{K(t)}z‖ ≤ speed |s − t|. The rules are derived in
-docs/theory/proofs.md.
-"""
+from typing import Any
 
-from typing import Any, NamedTuple
-
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .. import _tree
 from .._tree import Tree
 from ..programs.slope import Slope, Values, is_slope
-from ..sets import (
-    AbstractSet,
-    Ball,
-    ConstrainedBox,
-    Ellipsoid,
-    HalfSpace,
-    Hyperplane,
-    Intersection,
-    L1Ball,
-    Product,
-    Simplex,
-    Translated,
-)
-from ..sets._library import is_of_library, sets_in
-from ..spaces import AbstractSpace
-from ..spaces import Product as ProductSpace
-from .weights import flat_roots, full_weights
-
-_MAX_ROWS = 64
-"""Largest number of rows of a constrained box whose speed is bounded."""
-
-
-class Entries(NamedTuple):
-    """‖gain v‖, where vᵢ is the largest speed of entry i of the `arrays`. The gain is a vector, entry
-    by entry, or a matrix."""
-
-    arrays: tuple[Any, ...]
-    gain: Any
-
-
-class Sum(NamedTuple):
-    """The sum of the speeds of the parts."""
-
-    parts: tuple[Any, ...]
-
-
-class Independent(NamedTuple):
-    """The root of the sum of the squares of the speeds of the parts."""
-
-    parts: tuple[Any, ...]
-
-
-class Fixed(NamedTuple):
-    """Data that must not depend on t: the speed is 0, or unknown."""
-
-    arrays: tuple[Any, ...]
-
-
-class Description(NamedTuple):
-    """K(t) as arrays: bounds `low` ≤ y ≤ `high` of its elements, entry by entry; the `motion` of the
-    projection; and `gaps` that are ≥ 0 if and only if K(t) is not empty, if its `Fixed` data are."""
-
-    low: Tree
-    high: Tree
-    motion: Any
-    gaps: list[Any]
-
-
-def describe(
-    K: AbstractSet, pattern: AbstractSet, like: Tree, space: AbstractSpace
-) -> Description | None:
-    """Return a description of K(t), or None for a set without a rule here.
-
-    `pattern` is this set at one time, with concrete data: its zeros and sizes select the rule.
-    """
-    bounds = K.intervals(like)
-    if bounds is not None:
-        low, high = bounds
-        arrays = tuple(map(_flat, (low, high)))
-        gaps = jtu.tree_leaves(jtu.tree_map(jnp.subtract, high, low))
-        return Description(low, high, Entries(arrays, flat_roots(space, like)), gaps)
-    if isinstance(K, Product) and isinstance(pattern, Product):
-        return _product(K, pattern, like, space)
-    if isinstance(K, Translated) and isinstance(pattern, Translated):
-        inner = describe(K.set, pattern.set, like, space)
-        if inner is None:
-            return None
-        offset = jtu.tree_map(
-            lambda leaf, v: jnp.broadcast_to(v, leaf.shape),
-            like,
-            K.offset if isinstance(K.offset, tuple) else jtu.tree_map(lambda _: K.offset, like),
-        )
-        motion = Sum((inner.motion, _element(offset, space, like)))
-        return inner._replace(
-            low=_tree.add(inner.low, offset), high=_tree.add(inner.high, offset), motion=motion
-        )
-    if isinstance(K, HalfSpace | Hyperplane):
-        return _half_space(K, like, space)
-    if not isinstance(like, tuple):
-        if isinstance(K, Ball):
-            reach = K.radius / jnp.sqrt(jnp.broadcast_to(space.weights(), like.shape))
-            return _round(K.center, reach, _number(K.radius), K.radius, space, like)
-        if isinstance(K, L1Ball):
-            number = _number(_heaviest(space) * K.radius)
-            return _round(K.center, K.radius, number, K.radius, space, like)
-        if isinstance(K, Ellipsoid):
-            data = K.radii if K.shape is None else K.shape
-            assert data is not None
-            reach = data if K.shape is None else jnp.sqrt(jnp.diagonal(data))
-            return _round(K.center, reach, Fixed((data,)), None, space, like)
-        if isinstance(K, Simplex) and isinstance(pattern, Simplex):
-            return _simplex(K, pattern, like, space)
-        if isinstance(K, ConstrainedBox) and isinstance(pattern, ConstrainedBox):
-            return _constrained_box(K, pattern, like, space)
-    return _unmoved(K, pattern, like)
-
-
-def rejects_empty(K: AbstractSet) -> bool:
-    """Return whether the constructor of this set raises an error for an empty set."""
-    return is_of_library(K) and not any(isinstance(part, Intersection) for part in sets_in(K))
+from ..sets._motion import Entries, Fixed, Independent, Sum, Unbounded
 
 
 def speed_of(motion: Any) -> float:
@@ -146,7 +30,7 @@ def speed_of(motion: Any) -> float:
 
 def is_fixed(motion: Any) -> bool:
     """Return whether all data do not move that must not."""
-    if isinstance(motion, Fixed):
+    if isinstance(motion, Fixed | Unbounded):
         return not any(_entry_speeds(v).any() for v in motion.arrays)
     return isinstance(motion, Entries) or all(map(is_fixed, motion.parts))
 
@@ -154,118 +38,6 @@ def is_fixed(motion: Any) -> bool:
 def slopes(tree: Tree) -> list[Slope]:
     """Return the leaves of a tree of slopes."""
     return jtu.tree_leaves(tree, is_leaf=is_slope)
-
-
-def _product(K: Product, pattern: Product, like: Tree, space: AbstractSpace) -> Description | None:
-    spaces = space.spaces if isinstance(space, ProductSpace) else (space,) * len(K.parts)
-    given = zip(K.parts, pattern.parts, like, spaces, strict=True)
-    found = [describe(part, now, leaf, space) for part, now, leaf, space in given]
-    parts = [part for part in found if part is not None]
-    if len(parts) < len(found):
-        return None
-    motion = Independent(tuple(part.motion for part in parts))
-    gaps = [gap for part in parts for gap in part.gaps]
-    low, high = tuple(part.low for part in parts), tuple(part.high for part in parts)
-    return Description(low, high, motion, gaps)
-
-
-def _round(
-    center: Any, reach: Any, of_size: Any, gap: Any, space: AbstractSpace, like: jax.Array
-) -> Description:
-    """Return the description of center + {y : |yᵢ| ≤ reach and others}."""
-    center = jnp.broadcast_to(center, like.shape)
-    motion = Sum((_element(center, space, like), of_size))
-    gaps = [] if gap is None else [gap]
-    return Description(center - reach, center + reach, motion, gaps)
-
-
-def _half_space(K: HalfSpace | Hyperplane, like: Tree, space: AbstractSpace) -> Description:
-    """A plane at distance b/(Σ aᵢ²/wᵢ)^{1/2} from 0."""
-    normal, weights = _flat(K.normal), _flat(full_weights(space, like))
-    largest = jnp.max(jnp.abs(normal))  # the square of a very small normal would underflow
-    length = largest * jnp.sqrt(jnp.sum((normal / largest) ** 2 / weights))
-    motion = Sum((Fixed((normal,)), _number(K.offset / length)))
-    return Description(*_no_bounds(like), motion, [])
-
-
-def _simplex(K: Simplex, pattern: Simplex, like: jax.Array, space: AbstractSpace) -> Description:
-    """An entry rises at most by the share of the change of its total that its weight allows."""
-    if pattern.blocks is None or pattern.position is None:
-        total = jnp.broadcast_to(K.total[..., None], like.shape)
-        totals = jnp.broadcast_to(K.total, like.shape[:-1])  # one for each simplex that shares it
-    else:
-        numbers = np.concatenate([np.asarray(b.number).reshape(-1) for b in pattern.blocks])
-        simplex = numbers[np.asarray(pattern.position)]
-        total = jnp.broadcast_to(K.total, (simplex[-1] + 1,))[simplex]
-        totals = total[np.flatnonzero(np.diff(simplex, prepend=-1))]
-    motion = _number(_heaviest(space) * totals)
-    return Description(jnp.zeros_like(total), total, motion, [K.total])
-
-
-def _constrained_box(
-    K: ConstrainedBox, pattern: ConstrainedBox, like: jax.Array, space: AbstractSpace
-) -> Description:
-    """Rows without a common unknown act on parts of their own."""
-    lower, upper = (jnp.broadcast_to(v, like.shape) for v in (K.lower, K.upper))
-    R = np.asarray(pattern.R)
-    used = R != 0
-    if like.ndim != 1 or len(R) > _MAX_ROWS or used.sum(axis=0).max(initial=0) > 1 or not (
-        used.any(axis=1).all()
-    ):  # fmt: skip
-        data = (K.lower, K.upper, K.R, K.low, K.high)
-        return Description(lower, upper, Fixed(tuple(map(jnp.ravel, data))), [])
-    box = Entries((lower, upper), flat_roots(space, like))
-    # With the free unknowns of a row, at least one of them, it moves by its change over their length.
-    shares = np.abs(R) / flat_roots(space, like)[None]
-    lengths = jnp.min(jnp.where(used, shares, jnp.inf), axis=1)
-    rows = Sum((Entries((K.low, K.high), 1.0 / lengths),
-                Entries((lower, upper), np.abs(R) / lengths[:, None])))  # fmt: skip
-    least, greatest = [], []
-    for row in R:
-        (at,) = np.nonzero(row)
-        of_sign = row[at] > 0
-        ends = (jnp.where(of_sign, upper[at], lower[at]), jnp.where(of_sign, lower[at], upper[at]))
-        greatest.append(jnp.sum(row[at] * ends[0]))
-        least.append(jnp.sum(row[at] * ends[1]))
-    gaps = [upper - lower, K.high - K.low]
-    if least:
-        gaps += [K.high - jnp.stack(least), jnp.stack(greatest) - K.low]
-    motion = Sum((Fixed((jnp.ravel(K.R),)), Independent((box, rows))))
-    return Description(lower, upper, motion, gaps)
-
-
-def _unmoved(K: AbstractSet, pattern: AbstractSet, like: Tree) -> Description | None:
-    """Return the description of a set that is not empty and must not move, or None."""
-    leaves = jtu.tree_leaves(K)
-    # A function in a set may use t, which its code does not show.
-    if not (rejects_empty(pattern) and all(map(eqx.is_array_like, leaves))):
-        return None
-    arrays = tuple(jnp.ravel(jnp.asarray(leaf, float)) for leaf in leaves)
-    return Description(*_no_bounds(like), Fixed(arrays), [])
-
-
-def _element(value: Tree, space: AbstractSpace, like: Tree) -> Entries:
-    """Return the motion by an element, in the norm of the space."""
-    return Entries((_flat(value),), flat_roots(space, like))
-
-
-def _number(value: Any) -> Entries:
-    """Return the motion by a number or by an array of numbers, in the Euclidean norm."""
-    flat = jnp.ravel(value)
-    return Entries((flat,), jnp.ones_like(flat))
-
-
-def _heaviest(space: AbstractSpace) -> jax.Array:
-    return jnp.sqrt(jnp.max(space.weights()))
-
-
-def _flat(tree: Tree) -> jax.Array:
-    return jnp.concatenate([jnp.ravel(leaf) for leaf in jtu.tree_leaves(tree)])
-
-
-def _no_bounds(like: Tree) -> tuple[Tree, Tree]:
-    low = jtu.tree_map(lambda leaf: jnp.full(leaf.shape, -jnp.inf), like)
-    return low, jtu.tree_map(jnp.negative, low)
 
 
 def _entry_speeds(x: Slope) -> Values:

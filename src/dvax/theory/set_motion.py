@@ -16,7 +16,8 @@ from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, Values, interval, is_slope
 from ..programs.structure import independent
 from ..sets import AbstractSet
-from .projection_speed import describe, is_fixed, rejects_empty, slopes, speed_of
+from ..sets._motion import describe, rejects_empty
+from .projection_speed import is_fixed, slopes, speed_of
 from .set_bounds import bounds_of_fixed_set
 from .system import System
 

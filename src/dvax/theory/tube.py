@@ -19,6 +19,7 @@ from ..evolution import ETD2RK, RESULTS, Solution, solve
 from ..evolution.results import is_success
 from ..problem import Problem
 from ..programs.slope import Values, interval
+from ..sets._weights import full_weights
 from .certificate import Bound, bound_by_constants, continue_bound, disturbances, encloses_by
 from .constants import Constants
 from .error_ellipsoid import ErrorEllipsoid, Propagated, propagate
@@ -31,7 +32,6 @@ from .region import Region
 from .set_motion import set_motion
 from .system import System
 from .verify import constants_of, domain_of, intersect, response_box, without_limits
-from .weights import full_weights
 
 MAX_SAVED = 60
 """Largest number of saved times in a piece."""
