@@ -18,7 +18,7 @@ from dvax.evolution.enclosed_projection import by_its_rules
 from dvax.evolution.interpolated_response import Place, interpolated, interpolated_projection
 from dvax.evolution.moving_set import Motion
 from dvax.programs.enclosure import LinearEnclosure, constant, straight
-from dvax.sets._conditions import conditions
+from dvax.sets._conditions import Limits, limits, rows
 from dvax.sets._face import face
 from dvax.theory.faces import Range, derivatives_on_faces
 
@@ -130,13 +130,14 @@ def test_conditions_of_a_set_hold_on_it_and_nowhere_else(name):
     rng = np.random.default_rng(2)
     for _ in range(5):
         K = POLYHEDRAL[name](rng)
-        found = conditions(K, jnp.zeros(N))
+        R = rows(K, jnp.zeros(N))
+        found = limits(K, R, jnp.zeros(N))
         for z in rng.normal(size=(20, N)):
             y = np.asarray(placed()(K, EUCLIDEAN, jnp.asarray(z)).y)
-            values = found.R @ y
+            values = R @ y
             assert (values <= found.high + 1e-9).all() and (values >= found.low - 1e-9).all()
             # Elsewhere one is violated.
-            values = found.R @ z
+            values = R @ z
             holds = (values <= found.high + 1e-12).all() and (values >= found.low - 1e-12).all()
             assert holds == (np.abs(y - z).max() <= 1e-9)
 
@@ -149,14 +150,15 @@ def test_differences_of_projections_are_those_of_the_faces(name):
     known = unknown = 0
     for _ in range(40):
         K = POLYHEDRAL[name](rng)
-        found = conditions(K, jnp.zeros(N))
+        R = rows(K, jnp.zeros(N))
+        found = Limits(*(Range(*2 * [np.asarray(v)[None]]) for v in limits(K, R, jnp.zeros(N))))
         z = rng.normal(size=N) * rng.uniform(0.2, 2.0)
         others = z + 10.0 ** rng.uniform(-4, 0) * rng.normal(size=(6, N))
         points = [z, *others]
         y = np.stack([np.asarray(placed()(K, EUCLIDEAN, jnp.asarray(v)).y) for v in points])
         s = np.stack(points) - y
         boxes = [Range(v.min(axis=0)[None], v.max(axis=0)[None]) for v in (y, s)]
-        (center, radius), is_known = derivatives_on_faces(found, *boxes, 1e-14)
+        (center, radius), is_known = derivatives_on_faces(R, found, *boxes, 1e-14)
         for k in range(1, len(points)):
             p, q = y[k] - y[0], s[k] - s[0]
             assert (np.abs(p - center[0] @ (p + q)) <= radius[0] @ np.abs(p + q) + 1e-11).all()

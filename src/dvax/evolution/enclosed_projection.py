@@ -87,5 +87,6 @@ def gap(faces: tuple[Face, Face], scales: tuple[jax.Array, jax.Array]) -> jax.Ar
 
 
 def _product(mu: jax.Array, slack: jax.Array) -> jax.Array:
-    """Return a multiplier times a slack, which may be infinite where the multiplier is 0."""
-    return jnp.where(mu > 0.0, mu * slack, 0.0)
+    """Return a multiplier times a slack, which may be infinite where the multiplier is 0, and negative
+    by roundoff."""
+    return jnp.where(mu > 0.0, mu * jnp.maximum(slack, 0.0), 0.0)

@@ -127,7 +127,7 @@ def _is_enclosed(setup: Setup, plan: Plan) -> bool:
     # Without moduli nothing is certified, and a defect that is sampled allows longer steps.
     if not is_box and not setup.moduli:
         return False
-    if plan.closed_form and plan.interpolated and (is_box or not is_polyhedral(K)):
+    if plan.closed_form and plan.interpolated != (not is_box and is_polyhedral(K)):
         return False
     if not has_bounded_motion(problem, args, t0, like, problem.spaces(x0)[1]):
         return False

@@ -1,11 +1,14 @@
-"""The linear conditions of a polyhedral set."""
+"""The linear conditions low ≤ R y ≤ high of a polyhedral set, for the entries of y as one vector."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import scipy.linalg
 
+from .._small_matrices import times
 from .._tree import Tree
 from .abstract import AbstractSet
 from .affine import AffineSubspace
@@ -15,58 +18,89 @@ from .hyperplane import Hyperplane
 from .polyhedron import Polyhedron
 from .product import Product
 from .simplex import Simplex
-from .translated import Translated
+from .translated import Translated, full_offset
 
 
-class Conditions(NamedTuple):
-    """K = {y : low ≤ R y ≤ high} for the entries y of an element as one vector."""
+class Limits(NamedTuple):
+    """The limits of R y. `width`: high − low, which is 0 for an equation."""
 
-    R: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    low: Any
+    high: Any
+    width: Any
 
 
-def conditions(K: AbstractSet, like: Tree) -> Conditions | None:
-    """Return the conditions of a set with concrete data, for elements shaped like `like`, or None for a
-    set without a rule here."""
+def rows(K: AbstractSet, like: Tree) -> np.ndarray | None:
+    """Return R of a set with concrete data, for elements shaped like `like`, or None for a set without
+    a rule here."""
     if isinstance(K, Product):
-        parts = [conditions(k, part) for k, part in zip(K.parts, like, strict=True)]
+        parts = [rows(k, leaf) for k, leaf in zip(K.parts, like, strict=True)]
         known = [part for part in parts if part is not None]
-        return _product(known) if len(known) == len(parts) else None
+        return scipy.linalg.block_diag(*known) if len(known) == len(parts) else None
     if isinstance(K, Translated):
-        inner = conditions(K.set, like)
-        if inner is None:
-            return None
-        moved = inner.R @ _flat(K.offset, like)
-        return Conditions(inner.R, inner.low + moved, inner.high + moved)
-    size = sum(int(np.size(leaf)) for leaf in jtu.tree_leaves(like))
+        return rows(K.set, like)
+    size = _size(like)
+    if K.intervals(like) is not None:
+        return np.eye(size)
+    if isinstance(K, Simplex):
+        number = _numbers(K, like)
+        sums = np.arange(number.max() + 1)[:, None] == number
+        return np.concatenate([np.eye(size), sums.astype(float)])
+    matrices = [np.asarray(data, float).reshape(-1, size) for data in row_data(K)]
+    if isinstance(K, ConstrainedBox):
+        matrices.insert(0, np.eye(size))
+    return np.concatenate(matrices) if matrices else None
+
+
+def row_data(K: AbstractSet) -> list[jax.Array]:
+    """Return the data of K on which its rows depend."""
+    if isinstance(K, Product):
+        return [data for part in K.parts for data in row_data(part)]
+    if isinstance(K, Translated):
+        return row_data(K.set)
+    if isinstance(K, ConstrainedBox):
+        return [K.R]
+    if isinstance(K, Polyhedron):
+        return [K.G, K.E]
+    if isinstance(K, AffineSubspace):
+        return [K.E]
+    return [_flat(K.normal, K.normal)] if isinstance(K, HalfSpace | Hyperplane) else []
+
+
+def limits(K: AbstractSet, R: np.ndarray, like: Tree) -> Limits:
+    """Return the limits of a set with the rows R, which may move."""
+    if isinstance(K, Product):
+        found, row, column = [], 0, 0
+        for part, leaf in zip(K.parts, like, strict=True):
+            end = column + _size(leaf)
+            found.append(limits(part, R[row:, column:end], leaf))
+            row, column = row + len(found[-1].low), end
+        return _joined(*found)
+    if isinstance(K, Translated):
+        inner = limits(K.set, R, like)
+        moved = times(jnp.asarray(R[: len(inner.low)]), _flat(full_offset(K, like), like))
+        return inner._replace(low=inner.low + moved, high=inner.high + moved)
     bounds = K.intervals(like)
     if bounds is not None:
-        return Conditions(np.eye(size), *(_flat(end, like) for end in bounds))
+        return _between(*(_flat(end, like) for end in bounds))
     if isinstance(K, ConstrainedBox):
-        ends = (_flat(end, like) for end in (K.lower, K.upper))
-        low, high = (np.asarray(end, float) for end in (K.low, K.high))
-        return _joined(Conditions(np.eye(size), *ends), Conditions(_matrix(K.R, size), low, high))
+        box = _between(*(_flat(end, like) for end in (K.lower, K.upper)))
+        return _joined(box, _between(K.low, K.high))
     if isinstance(K, Polyhedron):
-        return _joined(_below(K.G, K.d, size), _equal(K.E, K.e, size))
+        return _joined(_below(K.d), _equal(K.e))
     if isinstance(K, AffineSubspace):
-        return _equal(K.E, K.e, size)
-    if isinstance(K, HalfSpace | Hyperplane):
-        row = _flat(K.normal, like)[None]
-        of = _below if isinstance(K, HalfSpace) else _equal
-        return of(row, np.reshape(np.asarray(K.offset), 1), size)
+        return _equal(K.e)
     if isinstance(K, Simplex):
-        positive = Conditions(np.eye(size), np.zeros(size), np.full(size, np.inf))
-        number = _numbers(K, like)
-        sums = (np.arange(number.max() + 1)[:, None] == number).astype(float)
-        shape = np.shape(like)[:-1] if K.blocks is None else (len(sums),)
-        total = np.broadcast_to(np.asarray(K.total, float), shape).reshape(-1)
-        return _joined(positive, _equal(sums, total, size))
-    return None
+        positive = _between(jnp.zeros(_size(like)), jnp.full(_size(like), jnp.inf))
+        simplices = len(R) - _size(like)
+        of_each = np.shape(like)[:-1] if K.blocks is None else (simplices,)
+        return _joined(positive, _equal(jnp.broadcast_to(K.total, of_each).reshape(-1)))
+    assert isinstance(K, HalfSpace | Hyperplane)
+    offset = jnp.reshape(K.offset, 1)
+    return _below(offset) if isinstance(K, HalfSpace) else _equal(offset)
 
 
 def _numbers(K: Simplex, like: Tree) -> np.ndarray:
-    """Return the number of the simplex of each entry."""
+    """Return for every entry the number of its simplex."""
     if K.blocks is None:
         return np.arange(np.size(like)) // np.shape(like)[-1]
     numbers = np.empty(np.size(like), int)
@@ -77,34 +111,26 @@ def _numbers(K: Simplex, like: Tree) -> np.ndarray:
     return numbers
 
 
-def _flat(tree: Tree, like: Tree) -> np.ndarray:
-    leaves = jtu.tree_map(
-        lambda v, w: np.broadcast_to(np.asarray(v, float), np.shape(w)), tree, like
-    )
-    return np.concatenate([leaf.reshape(-1) for leaf in jtu.tree_leaves(leaves)])
+def _size(like: Tree) -> int:
+    return sum(int(np.size(leaf)) for leaf in jtu.tree_leaves(like))
 
 
-def _matrix(rows: object, size: int) -> np.ndarray:
-    return np.asarray(rows, float).reshape(-1, size)
+def _flat(tree: Tree, like: Tree) -> jax.Array:
+    leaves = jtu.tree_map(lambda v, w: jnp.broadcast_to(v, np.shape(w)), tree, like)
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jtu.tree_leaves(leaves)])
 
 
-def _below(rows: object, bounds: object, size: int) -> Conditions:
-    high = np.asarray(bounds, float)
-    return Conditions(_matrix(rows, size), np.full(len(high), -np.inf), high)
+def _between(low: jax.Array, high: jax.Array) -> Limits:
+    return Limits(low, high, high - low)
 
 
-def _equal(rows: object, values: object, size: int) -> Conditions:
-    both = np.asarray(values, float)
-    return Conditions(_matrix(rows, size), both, both)
+def _below(high: jax.Array) -> Limits:
+    return Limits(jnp.full_like(high, -jnp.inf), high, jnp.full_like(high, jnp.inf))
 
 
-def _joined(*parts: Conditions) -> Conditions:
-    return Conditions(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+def _equal(values: jax.Array) -> Limits:
+    return Limits(values, values, jnp.zeros_like(values))
 
 
-def _product(parts: list[Conditions]) -> Conditions:
-    return Conditions(
-        scipy.linalg.block_diag(*(part.R for part in parts)),
-        np.concatenate([part.low for part in parts]),
-        np.concatenate([part.high for part in parts]),
-    )
+def _joined(*parts: Limits) -> Limits:
+    return Limits(*(jnp.concatenate(fields) for fields in zip(*parts, strict=True)))

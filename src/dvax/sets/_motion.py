@@ -18,7 +18,7 @@ from ..spaces import Product as ProductSpace
 from ._library import is_of_library, sets_in
 from ._weights import flat_roots, full_weights
 from .abstract import AbstractSet
-from .affine import AffineSubspace
+from .affine import AffineSubspace, normalised_conditions
 from .ball import Ball
 from .constrained_box import ConstrainedBox
 from .ellipsoid import Ellipsoid
@@ -195,18 +195,18 @@ def _constrained_box(
     """Rows without a common unknown act on parts of their own."""
     lower, upper = (jnp.broadcast_to(v, like.shape) for v in (K.lower, K.upper))
     R = np.asarray(pattern.R) if isinstance(pattern, ConstrainedBox) else None
-    if R is None or not _are_apart(R):
+    if len(K.R) > 1 and (R is None or not _are_apart(R)):
         bounds = Unbounded(tuple(map(jnp.ravel, (K.lower, K.upper, K.low, K.high))))
         return Description(lower, upper, Sum((Fixed((jnp.ravel(K.R),)), bounds)), [])
-    used = R != 0
     box = Entries((lower, upper), flat_roots(space, like))
     # With the free unknowns of a row, at least one of them, it moves by its change over their length.
-    shares = np.abs(R) / flat_roots(space, like)[None]
-    lengths = jnp.min(jnp.where(used, shares, jnp.inf), axis=1)
+    size = jnp.abs(K.R if R is None else jnp.asarray(R))
+    shares = size / flat_roots(space, like)[None]
+    lengths = jnp.min(jnp.where(size > 0.0, shares, jnp.inf), axis=1)
     rows = Sum((Entries((K.low, K.high), 1.0 / lengths),
-                Entries((lower, upper), np.abs(R) / lengths[:, None])))  # fmt: skip
+                Entries((lower, upper), size / lengths[:, None])))  # fmt: skip
     least, greatest = [], []
-    for row in R:
+    for row in () if R is None else R:
         (at,) = np.nonzero(row)
         of_sign = row[at] > 0
         ends = (jnp.where(of_sign, upper[at], lower[at]), jnp.where(of_sign, lower[at], upper[at]))
@@ -230,14 +230,18 @@ def _affine_subspace(
     K: AffineSubspace, pattern: AbstractSet | None, like: Tree, space: AbstractSpace
 ) -> Description:
     """The projection moves by the shortest element that changes the equations as e does."""
-    of_values: Any = Unbounded((K.e,))
-    if isinstance(pattern, AffineSubspace):
-        scaled = np.asarray(pattern.E, float).reshape(len(pattern.e), -1)
+    if not isinstance(pattern, AffineSubspace):
+        rows, values = normalised_conditions(K.E, K.e)
+        back = jnp.linalg.pinv(rows / flat_roots(space, like)[None])
+        of_values: Any = Entries((values,), jnp.abs(back))
+    else:
+        E, e = pattern.E, K.e
         with jax.ensure_compile_time_eval():
-            scaled = scaled / np.asarray(flat_roots(space, like))
+            scaled = np.asarray(E, float).reshape(len(E), -1) / np.asarray(flat_roots(space, like))
         # No element may change equations that depend on each other.
-        if np.linalg.matrix_rank(scaled) == len(scaled):
-            of_values = Entries((K.e,), jnp.asarray(np.abs(np.linalg.pinv(scaled))))
+        is_independent = np.linalg.matrix_rank(scaled) == len(scaled)
+        back = np.abs(np.linalg.pinv(scaled))
+        of_values = Entries((e,), jnp.asarray(back)) if is_independent else Unbounded((e,))
     motion = Sum((Fixed((jnp.ravel(K.E),)), of_values))
     return Description(*_no_bounds(like), motion, [])
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..programs.slope import Values
-from ..sets._conditions import Conditions
+from ..sets._conditions import Limits
 from .blocks import Block
 
 _RANK, _ZERO = 1e-6, 1e-14
@@ -43,26 +43,28 @@ class Range(NamedTuple):
 
 
 def derivatives_on_faces(
-    K: Conditions, y: Range, force: Range, eps: float
+    R: np.ndarray, limits: Limits, y: Range, force: Range, eps: float
 ) -> tuple[Block, np.ndarray]:
-    """Return D for each box of y and of a multiple of s, which are rows of bounds, and whether it is
-    known.
+    """Return D for each box of y, of a multiple of s and of the limits of R y, which are rows of
+    bounds, and whether it is known.
 
     All are in coordinates in which the norm of the space is Euclidean. `eps` is the relative error of
     y and of s."""
-    lengths = np.linalg.norm(K.R, axis=1)
+    lengths = np.linalg.norm(R, axis=1)
     lengths[lengths == 0.0] = 1.0
-    R, low, high = K.R / lengths[:, None], K.low / lengths, K.high / lengths
+    R = R / lengths[:, None]
+    low, high, width = (Range(v.low / lengths, v.high / lengths) for v in limits)
     center, half = y.image(R)
     size = np.maximum(np.abs(y.low), np.abs(y.high)) @ np.abs(R).T
-    bound = np.where(np.isfinite(low), np.abs(low), 0.0) + np.where(
-        np.isfinite(high), np.abs(high), 0.0
+    bound = sum(
+        np.where(np.isfinite(v), np.abs(v), 0.0) for v in (low.low, low.high, high.low, high.high)
     )
     half = half + _ROUNDINGS * eps * (size + bound)
-    maybe = (center + half >= high) | (center - half <= low)
+    maybe = (center + half >= high.low) | (center - half <= low.high)
+    is_equation = (width.low == 0.0) & (width.high == 0.0)
     found = [
-        _derivative(R[rows], (low == high)[rows], Range(*ends), eps)
-        for rows, *ends in zip(maybe, force.low, force.high, strict=True)
+        _derivative(R[may], equation[may], Range(*ends), eps)
+        for may, equation, *ends in zip(maybe, is_equation, force.low, force.high, strict=True)
     ]
     D, radius, known = (np.stack(parts) for parts in zip(*found, strict=True))
     return Block(D, radius), known

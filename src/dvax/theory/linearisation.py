@@ -24,6 +24,7 @@ import numpy as np
 
 from .. import _tree
 from ..programs.slope import TooLarge, Values
+from ..sets._conditions import Limits
 from .blocks import Block, as_one_matrix, identity, norms
 from .faces import Range, derivatives_on_faces
 from .local_derivatives import Derivatives
@@ -125,18 +126,18 @@ def _derivative_of_projection(
     """Return D for each box, and whether it is known; None if K has no rule."""
     root = np.concatenate(roots(system.control, system.u0))
     separation = max(_SEPARATION, 64.0 * float(np.finfo(_tree.dtype(system.u0)).eps))
-    if J.ends is not None:
-        low, high = _entries_on_box(J, J.ends, root, separation, P)
+    if system.rows is None and J.limits:
+        low, high = _entries_on_box(J, (J.limits[0], J.limits[1]), root, separation, P)
         center, radius = 0.5 * (low + high), 0.5 * (high - low)
         eye = np.eye(len(root))
         return Block(center[:, :, None] * eye, radius[:, :, None] * eye), (low == high).all(axis=1)
-    K = system.conditions
-    if K is None:
+    if system.rows is None:
         return None
     u, h = (Range(root * v.low, root * v.high) for v in (J.u, J.h))
     center, half = u.image(P)
     y, force = Range(center - half, center + half), Range(h.low - u.high, h.high - u.low)
-    return derivatives_on_faces(K._replace(R=K.R / root), y, force, separation)
+    limits = Limits(*J.limits)
+    return derivatives_on_faces(system.rows / root, limits, y, force, separation)
 
 
 def _entries_on_box(

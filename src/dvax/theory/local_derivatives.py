@@ -29,7 +29,7 @@ from .blocks import Block, as_one_matrix
 from .faces import Range
 from .projection_speed import slopes
 from .region import Region
-from .system import System
+from .system import System, limits_at
 from .weights import roots
 
 MAX_UNKNOWNS = 40
@@ -41,8 +41,8 @@ _ROUNDINGS = 500.0
 
 class Derivatives(NamedTuple):
     """∂f/∂x, ∂f/∂u, ∂h/∂x and ∂h/∂u in the norms of the spaces, as stacks with one matrix for each box;
-    the values there of u, of h, and of both ends of the box K(t), which are None if K is no box. u may
-    be outside K: its bounds are rounded, and must not hide that it is at one of them."""
+    the values there of u, of h, and of the `System.limits` of K(t). u may be outside K: its bounds are
+    rounded, and must not hide that it is at one of them."""
 
     f_x: Block
     f_u: Block
@@ -50,7 +50,7 @@ class Derivatives(NamedTuple):
     h_u: Block
     u: Range
     h: Range
-    ends: tuple[Range, Range] | None
+    limits: tuple[Range, ...]
 
 
 def of_region(system: System, region: Region, wide: Range | None = None) -> Derivatives | None:
@@ -65,12 +65,8 @@ def of_region(system: System, region: Region, wide: Range | None = None) -> Deri
         f_x, f_u, h_x, h_u = map(as_one_matrix, known)
     except TooLarge:
         return None
-    bounds = system.interval_bounds(region.t)
-    low, high = (
-        (None, None) if bounds is None else (Range(b.low[None], b.high[None]) for b in bounds)
-    )
-    ends = None if low is None or high is None else (low, high)
-    return Derivatives(f_x, f_u, h_x, h_u, wide or _range(region.u), _range(J.h), ends)
+    limits = tuple(Range(b.low[None], b.high[None]) for b in system.limits(region.t))
+    return Derivatives(f_x, f_u, h_x, h_u, wide or _range(region.u), _range(J.h), limits)
 
 
 class LocalDerivatives:
@@ -124,7 +120,7 @@ class LocalDerivatives:
         more = max(0, capacity - count)
         time, *others = (np.pad(c, ((0, more), (0, 0)), "edge") for c in centers)
         values = _values(
-            self.system.problem, _tree.as_arrays(self.system.args),
+            self.system.problem, _tree.as_arrays(self.system.args), self.system.rows,
             (time[:, 0], *others), self.likes,
         )  # fmt: skip
         found = []
@@ -139,15 +135,14 @@ class LocalDerivatives:
                     moved = np.where(size == 0.0, 0.0, halves[k][:, :, None] * size).sum(axis=1)
                 radius = radius + moved.reshape(center.shape)
             found.append((center, radius))
-        J, (h, *ends) = found[:4], (Range(c - r, c + r) for c, r in found[4:])
+        J, (h, *limits) = found[:4], (Range(c - r, c + r) for c, r in found[4:])
         f_x, f_u, h_x, h_u = (
             Block(center * (out[:, None] / into), radius * (out[:, None] / into))
             for (center, radius), (out, into) in zip(
                 J, itertools.product((self.root_x, self.root_u), repeat=2), strict=True
             )
         )
-        box = (ends[0], ends[1]) if ends else None
-        return Derivatives(f_x, f_u, h_x, h_u, wide or boxes[2], h, box)
+        return Derivatives(f_x, f_u, h_x, h_u, wide or boxes[2], h, tuple(limits))
 
     @cached_property
     def _enclosure(self) -> SlopeEnclosure | None:
@@ -155,15 +150,17 @@ class LocalDerivatives:
         flat = [jnp.zeros(size) for size in (self.n, self.k)]
         try:
             return SlopeEnclosure(
-                lambda *point: _evaluated(system.problem, system.args, point, self.likes),
+                lambda *point: _evaluated(system.problem, system.args, system.rows, point, self.likes),
                 (jnp.zeros(()), *flat), (0, 1, 2),
             )  # fmt: skip
         except (NotImplementedError, TypeError, ValueError):
             return None  # without derivatives, or those in forward mode
 
 
-def _evaluated(problem: Problem, args: Any, point: tuple[Any, ...], likes: Any) -> tuple[Any, ...]:
-    """Return the derivatives of f and h at a point as matrices, the value of h, and the ends of K."""
+def _evaluated(
+    problem: Problem, args: Any, R: Any, point: tuple[Any, ...], likes: Any
+) -> tuple[Any, ...]:
+    """Return the derivatives of f and h at a point as matrices, the value of h, and the limits of K."""
     t, x, u = point
     of_x, of_u = (ravel_pytree(like)[1] for like in likes)
 
@@ -173,15 +170,15 @@ def _evaluated(problem: Problem, args: Any, point: tuple[Any, ...], likes: Any) 
 
     plain = of_operations(both, x, u)
     ((f_x, f_u), (h_x, h_u)), h = jax.jacfwd(plain, argnums=(0, 1), has_aux=True)(x, u)
-    bounds = problem.set_at(t, args).intervals(likes[1])
-    ends = () if bounds is None else tuple(ravel_pytree(end)[0] for end in bounds)
-    return f_x, f_u, h_x, h_u, h, *ends
+    return f_x, f_u, h_x, h_u, h, *limits_at(problem, args, R, t, likes[1])
 
 
 @eqx.filter_jit
-def _values(problem: Problem, args: Any, points: tuple[Any, ...], likes: Any) -> tuple[Any, ...]:
+def _values(
+    problem: Problem, args: Any, R: Any, points: tuple[Any, ...], likes: Any
+) -> tuple[Any, ...]:
     """Return `_evaluated` for stacks of times, states and responses."""
-    return jax.vmap(lambda point: _evaluated(problem, args, point, likes))(points)
+    return jax.vmap(lambda point: _evaluated(problem, args, R, point, likes))(points)
 
 
 def _flat(tree: Tree) -> Slope:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -13,8 +14,8 @@ from .._tree import Tree
 from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval
 from ..programs.structure import independent
-from ..sets._conditions import Conditions, conditions
-from ..sets._library import is_of_library
+from ..sets._conditions import limits, row_data, rows
+from ..sets._face import is_polyhedral
 from .blocks import Block, block, identity
 from .region import Region
 from .weights import roots
@@ -100,31 +101,26 @@ class System:
             raise TooLarge
         return identity(h_u).plus(h_u, -1.0) @ self.P_inv
 
-    def interval_bounds(self, time: Slope) -> tuple[Slope, Slope] | None:
-        """Return both ends of the intervals of K(t), entry by entry, or None if K is not a box."""
-        if self._intervals is None:
-            return None
-        low, high = self._intervals(time).out
-        return low, high
+    def limits(self, time: Slope) -> tuple[Slope, ...]:
+        """Return the limits of K(t): both ends of the intervals of a box, entry by entry, or the limits
+        of the rows and their widths; nothing for another set."""
+        return () if self._limits is None else self._limits(time).out
 
     @cached_property
-    def conditions(self) -> Conditions | None:
-        """The linear conditions of a set that does not move and is no box, or None."""
-        problem, args = self.problem, self.args
-        set_at = lambda t: jtu.tree_leaves(problem.set_at(t, args))  # noqa: E731
+    def rows(self) -> np.ndarray | None:
+        """The rows of the linear conditions of a set that is no box, if they do not depend on t."""
+        problem, args, like = self.problem, self.args, self.u0
         K = problem.set_at(jnp.zeros(()), args)
-        if not is_of_library(K) or not independent(set_at, jnp.zeros(())):
+        if K.intervals(like) is not None or not is_polyhedral(K):
             return None
-        return conditions(K, self.u0)
+        is_fixed = independent(lambda t: row_data(problem.set_at(t, args)), jnp.zeros(()))
+        return rows(K, like) if is_fixed else None
 
     @cached_property
-    def _intervals(self) -> SlopeEnclosure | None:
-        def ends(t: Any) -> Any:
-            bounds = self.problem.set_at(t, self.args).intervals(self.u0)
-            return None if bounds is None else tuple(ravel_pytree(end)[0] for end in bounds)
-
+    def _limits(self) -> SlopeEnclosure | None:
         time = jnp.zeros(())
-        return None if ends(time) is None else SlopeEnclosure(ends, (time,), ())
+        of_set = lambda t: limits_at(self.problem, self.args, self.rows, t, self.u0)  # noqa: E731
+        return SlopeEnclosure(of_set, (time,), ()) if of_set(time) else None
 
     def _of_linear(self, apply: Callable[[Tree], Tree], space: Any, like: Tree) -> Block | None:
         """Return the matrix of a linear map, or None if it is too large or has operations without a
@@ -145,3 +141,15 @@ def _block_or_none(*args: Any) -> Block | None:
         return block(*args)
     except TooLarge:
         return None
+
+
+def limits_at(
+    problem: Problem, args: Any, R: np.ndarray | None, t: Any, like: Tree
+) -> tuple[jax.Array, ...]:
+    """Return both ends of a box K(t), or the limits of the rows R and their widths, as vectors; nothing
+    for another set."""
+    K = problem.set_at(t, args)
+    bounds = K.intervals(like)
+    if bounds is not None:
+        return tuple(ravel_pytree(end)[0] for end in bounds)
+    return () if R is None else tuple(limits(K, R, like))
