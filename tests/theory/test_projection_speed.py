@@ -52,6 +52,9 @@ MOVING = {
             0.1 * t, 2.0 + center(t), ONE_ROW, jnp.ones(1), 1.0 + t * jnp.ones(1)
         ), 0.02,
     ),
+    "two equations": (
+        lambda t: sets.AffineSubspace(TWO_ROWS, jnp.stack([jnp.sin(t), t**2])), 0.6,
+    ),
     "a box with two sums": (
         lambda t: sets.ConstrainedBox(
             jnp.full(5, -jnp.inf), 3.0, TWO_ROWS, jnp.stack([jnp.sin(t), jnp.cos(t)]),

@@ -137,8 +137,8 @@ def solve_by_implicit_steps(
     result = RESULTS.where(is_out_of_steps, RESULTS.max_steps, RESULTS.implicit_unsolved)
     result = RESULTS.where(is_successful, RESULTS.successful, result)
     times = stops[-1:] if ts is None else ts
-    passed = jax.vmap(lambda s: clock.time(s)[0])(lax.stop_gradient(times))
-    rows = with_tangents(Saved(jnp.where(reached, passed, jnp.inf), xs), times, *given)
+    at_rows = jax.vmap(lambda s: clock.time(s)[0])(lax.stop_gradient(times))
+    rows = with_tangents(Saved(jnp.where(reached, at_rows, jnp.inf), xs), times, *given)
     # Of a failed run, report the last saved time that it reached.
     count = jnp.sum(reached)
     row = jnp.maximum(count - 1, 0)

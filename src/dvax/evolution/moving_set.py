@@ -5,6 +5,7 @@ the lines. For every z, the projection of z onto K'(θ) moves by at most `change
 is within `deviation` of that onto K(t) (`dvax.sets._motion`).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from ..problem import Problem
 from ..programs.enclosure import LinearEnclosure, NoEnclosure, enclose
 from ..programs.structure import affine_between_knots, independent
 from ..sets._library import is_of_library
-from ..sets._motion import Entries, Independent, Sum, Unbounded, describe
+from ..sets._motion import Entries, Fixed, Independent, Sum, Unbounded, describe
 from ..spaces import AbstractSpace
 
 
@@ -57,32 +58,39 @@ def motion(
 def has_bounded_motion(
     problem: Problem, args: Any, t: Any, like: Tree, space: AbstractSpace
 ) -> bool:
-    """Return whether `motion` is finite where the data of K are smooth, as far as the kind of the set
-    and the code of K show.
+    """Return whether the code of K proves that `motion` is finite where the data of K are smooth.
 
-    Rows that share unknowns have no bound unless their data are lines between knots."""
+    A matrix, a normal or a factor must not move. Rows that share unknowns have a bound only if their
+    limits are lines between knots."""
     K = problem.set_at(t, args)
     if K.intervals(like) is not None:
         return True
     if not is_of_library(K) or _is_fixed(problem, args, t):
         return is_of_library(K)
 
-    def unbounded(t: Any) -> list[jax.Array]:
-        found = describe(problem.set_at(t, args), None, like, space)
-        return [] if found is None else _unbounded(found.motion)
+    if describe(K, None, like, space) is None:
+        return False
 
-    return describe(K, None, like, space) is not None and affine_between_knots(unbounded, t)
+    def arrays(kind: Any) -> Callable[[Any], list[jax.Array]]:
+        def of(t: Any) -> list[jax.Array]:
+            found = describe(problem.set_at(t, args), None, like, space)
+            assert found is not None
+            return _arrays(found.motion, kind)
+
+        return of
+
+    return independent(arrays(Fixed), t) and affine_between_knots(arrays(Unbounded), t)
 
 
 def _is_fixed(problem: Problem, args: Any, t: Any) -> bool:
     return independent(lambda t: jtu.tree_leaves(problem.set_at(t, args)), t)
 
 
-def _unbounded(motion: Any) -> list[jax.Array]:
-    """Return the data without a bound."""
+def _arrays(motion: Any, kind: Any) -> list[jax.Array]:
+    """Return the data of this kind."""
     if isinstance(motion, Sum | Independent):
-        return [v for part in motion.parts for v in _unbounded(part)]
-    return list(motion.arrays) if isinstance(motion, Unbounded) else []
+        return [v for part in motion.parts for v in _arrays(part, kind)]
+    return list(motion.arrays) if isinstance(motion, kind) else []
 
 
 def _distance(motion: Any, part: Any, zero: jax.Array) -> jax.Array:
@@ -90,8 +98,11 @@ def _distance(motion: Any, part: Any, zero: jax.Array) -> jax.Array:
     if isinstance(motion, Entries):
         moved = jnp.max(jnp.stack([part(q) for q in motion.arrays]), axis=0)
         gain = motion.gain.largest
+        if gain.ndim == 2:
+            moved = moved[None]
         of_entries = jnp.where(moved > 0.0, gain * moved, 0.0)
-        of_entries = of_entries if gain.ndim == 1 else jnp.sum(of_entries, axis=1)
+        if gain.ndim == 2:
+            of_entries = jnp.sum(of_entries, axis=1)
         return jnp.sqrt(jnp.sum(jnp.square(of_entries)))
     if isinstance(motion, Sum):
         return sum((_distance(v, part, zero) for v in motion.parts), zero)
