@@ -177,6 +177,20 @@ def test_bound_error_continues_only_from_the_last_bounded_time():
         dvax.bound_error(case.problem, second, case.constants, initial_error=before)
 
 
+@pytest.mark.slow
+def test_bound_error_continues_only_with_the_state_of_the_bound():
+    case = ALL["C1"]()
+    run = lambda x, t0, t1: dvax.solve(  # noqa: E731
+        case.problem, x, t0, t1, args=case.args, ts=[t1], dt=0.125, measure=True
+    )
+    first = run(-1.0, 0.0, 1.0)
+    before = dvax.bound_error(case.problem, first, case.constants)
+    other = run(first.xs[-1] + 1e-3, 1.0, 2.0)
+    for constants in (case.constants, None):
+        with pytest.raises(dvax.InputError, match="with the state that it is about"):
+            dvax.bound_error(case.problem, other, constants, initial_error=before)
+
+
 def replaced(constants, **more):
     names = ("gamma", "L_F", "alpha_h", "beta_h", "alpha_f", "beta_f", "M", "omega", "m_P",
              "norm_P_inv", "one_sided")  # fmt: skip

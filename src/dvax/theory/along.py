@@ -30,7 +30,7 @@ from .._tree import Tree
 from ..evolution import Solution
 from ..problem import Problem
 from ..spaces import AbstractSpace
-from .certificate import Bound
+from .certificate import Bound, last_state
 from .status import Status, weakest
 from .tube import MAX_SAVED, Piece, Tube
 
@@ -210,7 +210,7 @@ def _assembled(problem: Problem, sol: Solution, rows: list[_Row], why: str) -> B
     x, u, x_paper, u_paper, x_sharp, u_sharp = (jnp.asarray(v, sol.ts.dtype) for v in bounds)
     return Bound(
         sol.ts, x, u, x_paper, u_paper, x_sharp, u_sharp,
-        status, None, why,
+        status, None, why, last_state(sol),
     )  # fmt: skip
 
 

@@ -29,9 +29,11 @@ from .._captured import Reads, current
 from .._dataset import Variable, dataset, described
 from .._once import once_per_object
 from .._repr import is_known, last_text, table, value_text
+from .._tree import Tree
 from ..errors import InputProblem, Problems, input_error
 from ..evolution import Implicit, Solution, between, disturbance, gronwall
 from ..evolution.defect import ROUNDINGS
+from ..evolution.setup import Setup
 from ..evolution.solve import run_again
 from ..generators import AbstractGenerator, AbstractMatrixFree, Growth, Product
 from ..operators import AbstractOperator, Spectrum
@@ -50,6 +52,7 @@ class Bound(eqx.Module):
     - `x_sharp`, `u_sharp`: with the one-sided constant μ or the rate of an energy norm, whichever is
       smaller; None if neither is known;
     - `why`: the reason for which the bound is infinite from some time on, or estimated, or empty;
+    - `last`: the last saved state, at which a run that goes on starts;
     - `integrals`, (m, k): the Gronwall estimates of the k rates over their factors M, with which a run
       that goes on starts; None if the problem was solved again;
     - `status`: the weakest status among the quantities in the bound. "proved" means that the constants
@@ -85,6 +88,7 @@ class Bound(eqx.Module):
     status: Status = eqx.field(static=True)
     integrals: jax.Array | None = None
     why: str = eqx.field(static=True, default="")
+    last: Tree | None = None
 
     def __repr__(self) -> str:
         about = {"x": "‖x_h − x‖", "u": "‖u_h − u‖"}
@@ -239,7 +243,13 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
     return Bound(
         sol.ts, valid(best_x), valid(best_u), valid(x), valid(u), valid(x_sharp), valid(u_sharp),
         status, valid(integrals) if measured is sol else None, why or _overflow(best_x),
+        last_state(sol),
     )  # fmt: skip
+
+
+def last_state(sol: Solution) -> Tree | None:
+    """Return the state at the last saved time, None without saved times."""
+    return jtu.tree_map(lambda leaf: leaf[-1], sol.xs) if len(sol.ts) else None
 
 
 def _exit(domain: Domain, ts: jax.Array, inside: jax.Array, values: tuple, rates: list[Any]) -> str:
@@ -393,16 +403,31 @@ def check_bounded(problem: Problem, sol: Any, initial_error: Any) -> None:
                 "Pass 0 if the initial state is exact, or the Bound of the previous run",
             )
     if isinstance(initial_error, Bound):
-        problems += _continuation_problems(initial_error, sol.setup.setting["t0"])
+        problems += _continuation_problems(initial_error, sol.setup)
     problems.raise_any()
 
 
-def _continuation_problems(previous: Bound, t0: Any) -> list[InputProblem]:
-    """Return the problems of continuing from the bound `previous` at t0."""
+def _continuation_problems(previous: Bound, setup: Setup) -> list[InputProblem]:
+    """Return the problems of continuing with a run from the bound `previous`."""
+    t0, x0 = setup.setting["t0"], setup.x0
     if previous.ts.shape[0] > 0:
-        end = previous.ts[-1]
-        if not _tree.is_concrete(end, t0) or float(end) == float(np.asarray(t0, end.dtype)):
+        end, last = previous.ts[-1], previous.last
+        if not _tree.is_concrete(end, t0, last, x0):
             return []
+        if float(end) == float(np.asarray(t0, end.dtype)):
+            if last is None or all(
+                np.array_equal(a, b)
+                for a, b in zip(jtu.tree_leaves(last), jtu.tree_leaves(x0), strict=True)
+            ):
+                return []
+            return [
+                InputProblem(
+                    "dvax.bound_error(initial_error)",
+                    f"a Bound of the state {_tree.short(last)} for a run from {_tree.short(x0)}",
+                    "a bound goes on with the state that it is about",
+                    "Start from sol.xs[-1], or give the error of the new x0 as a number",
+                )
+            ]
         value_text = f"a Bound up to t = {float(end):.17g} for a run from t0 = {float(t0):.17g}"
     else:
         value_text = "a Bound without a saved time"
