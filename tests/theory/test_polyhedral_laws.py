@@ -82,7 +82,7 @@ def test_projection_of_a_line_stays_near_the_line_between_its_ends(name):
         K, space = POLYHEDRAL[name](rng), (EUCLIDEAN, WEIGHTED)[trial % 2]
         a = jnp.asarray(rng.normal(size=N))
         b = a + 10.0 ** rng.uniform(-5, 0.5) * rng.normal(size=N)
-        line, apart = enclosed(
+        line, apart, _ = enclosed(
             K, space, straight(a, b), (placed()(K, space, a), placed()(K, space, b)), jnp.zeros(())
         )
         thetas = np.linspace(0.0, 1.0, 33)[:, None]

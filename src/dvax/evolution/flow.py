@@ -31,7 +31,7 @@ from ..sets._library import is_of_library
 from ..spaces import AbstractSpace
 from ..vi import RESULTS, AbstractSolver, FrozenVI
 from ..vi.known import Known
-from .enclosed_projection import by_its_rules, part, widened
+from .enclosed_projection import by_its_rules, part
 from .interpolated_response import Place, interpolated, interpolated_projection
 from .law_tolerance import LawTolerance
 from .linearised import AbstractLinear, finite, linearise
@@ -231,8 +231,8 @@ class Flow(eqx.Module):
         """
         problem, args = self.problem, self.args
         f = lambda t, x, u: problem.f(t, x, u, args)  # noqa: E731
-        if self.direct and self.small_box is None:
-            u = self._enclosed_response(t, x, first, last)
+        if self.direct and self.small_box is None and not self.interpolated:
+            u = self._enclosed_response(t, x)
             zero = jnp.zeros_like(t.dev)
             return EnclosedRate(enclose(f, t, x, u), u, zero, zero, zero)
         places = self._places(t, x, first, last)
@@ -243,9 +243,20 @@ class Flow(eqx.Module):
         L_F, norm_P_inv, gain = (
             jnp.asarray(v * more, dtype) for v in (self.L_F, self.norm_P_inv, self.tol.gain)
         )
-        line = interpolated(problem, args, self.operator, t, x, places, gamma, L_F)
-        effects = norm_P_inv * line.residual / gamma, gain * line.resolved / gamma
-        return EnclosedRate(enclose(f, t, x, line.u), line.u, line.residual, *effects)
+        if self.direct and self.small_box is None:
+            z, space = self._enclosed_point(t, x), problem.spaces(part(x, "a"))[1]
+            moves = motion(problem, args, t, part(z, "a"), space)
+            y, residual, resolved = interpolated_projection(
+                self.set_at(t.a), space, z, places, moves.deviation
+            )
+            u = enclose(self.operator.inverse, y)
+            residual, resolved = gamma * residual, gamma * resolved
+        else:
+            u, residual, resolved = interpolated(
+                problem, args, self.operator, t, x, places, gamma, L_F
+            )
+        effects = norm_P_inv * residual / gamma, gain * resolved / gamma
+        return EnclosedRate(enclose(f, t, x, u), u, residual, *effects)
 
     def _places(
         self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
@@ -269,31 +280,27 @@ class Flow(eqx.Module):
         y = K.project(z, space) if found is None else found.y
         return jax.lax.stop_gradient(Place(z, y, found))
 
-    def _enclosed_response(
-        self, t: LinearEnclosure, x: Tree, first: Rate | None, last: Rate | None
-    ) -> Tree:
-        """Return the enclosure of the response of a law in closed form."""
-        problem, args = self.problem, self.args
-        start = part(x, "a")
-        zero, space = problem.zero_control(start), problem.spaces(start)[1]
+    def _enclosed_point(self, t: LinearEnclosure, x: Tree) -> Tree:
+        """Return the enclosure of z, whose projection is y, for a law in closed form."""
         if self.reciprocal is None:
             raise NoEnclosure("a slope of the law that moves")
+        problem, args = self.problem, self.args
+        zero = problem.zero_control(part(x, "a"))
         drive = enclose(lambda t, x: problem.h(t, x, zero, args), t, x)
-        z = enclose(lambda d: jtu.tree_map(jnp.multiply, d, self.reciprocal), drive)
-        K = problem.set_at(t.a, args)
-        if K.intervals(zero) is not None:
-            ends = enclose(lambda t: problem.set_at(t, args).intervals(zero), t)
+        return enclose(lambda d: jtu.tree_map(jnp.multiply, d, self.reciprocal), drive)
+
+    def _enclosed_response(self, t: LinearEnclosure, x: Tree) -> Tree:
+        """Return the enclosure of the response of a law in closed form, by the rules of the
+        projection."""
+        problem, args, z = self.problem, self.args, self._enclosed_point(t, x)
+        like, space = part(z, "a"), problem.spaces(part(x, "a"))[1]
+        if self.set_at(t.a).intervals(like) is not None:
+            ends = enclose(lambda t: problem.set_at(t, args).intervals(like), t)
             y = jtu.tree_map(
                 lambda q, low, up: smallest(largest(q, low), up), z, *ends, is_leaf=is_enclosure
             )
-        elif self.interpolated:
-            moves = motion(problem, args, t, zero, space)
-            places = self._places(t, x, first, last)
-            y, apart = interpolated_projection(K, space, z, places, moves.deviation)
-            y = widened(y, apart, space)
         else:
-            moves = motion(problem, args, t, zero, space)
-            y = by_its_rules(problem, args, space, t, z, moves)
+            y = by_its_rules(problem, args, space, t, z, motion(problem, args, t, like, space))
         return enclose(self.operator.inverse, y)
 
     def switches_of(self, t: Any, x: Tree, rate: Rate) -> list[jax.Array] | None:

@@ -108,10 +108,10 @@ def interpolated(
 
 def interpolated_projection(
     K: AbstractSet, space: AbstractSpace, z: Tree, places: tuple[Place, Place], deviation: Any
-) -> tuple[Tree, jax.Array]:
+) -> tuple[Tree, jax.Array, jax.Array]:
     """Return the line between the projections onto a polyhedral set at two places, as enclosures, and
-    a bound on the distance of the projection from it, for an enclosure of z and the deviation of the
-    set.
+    bounds on the distance of the projection from it, with roundoff and without, for an enclosure of z
+    and the deviation of the set.
 
     This is the law of F(y) = y − z."""
     first, last = places
@@ -122,9 +122,12 @@ def interpolated_projection(
         space.norm(_tree.sub(part(z, end), place.z))
         for end, place in zip(("a", "b"), places, strict=True)
     ]
-    r = jnp.maximum(*ends) + space.norm(part(z, "dev")) + 2.0 * rounding
-    apart = 0.5 * (r + jnp.sqrt(jnp.square(r) + g)) + rounding + 2.0 * deviation
-    return straight(first.y, last.y), apart
+    r = jnp.maximum(*ends) + space.norm(part(z, "dev"))
+    apart, resolved = (
+        0.5 * (r + more + jnp.sqrt(jnp.square(r + more) + g)) + 2.0 * deviation
+        for more in (2.0 * rounding, 0.0)
+    )
+    return straight(first.y, last.y), apart + rounding, resolved
 
 
 def _step(y: Tree, F: Tree, L_F: Any) -> Tree:

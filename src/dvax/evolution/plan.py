@@ -119,7 +119,7 @@ def _is_enclosed(setup: Setup, plan: Plan) -> bool:
     """Return whether f̃ has an enclosure over a step in the way of a plan: its operations have rules,
     the motion of K has a bound, and the moduli of a law without closed form are known."""
     problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
-    if not plan.closed_form and not _MODULI <= set(setup.moduli):
+    if plan.interpolated and not _MODULI <= set(setup.moduli):
         return False
     args, like = _tree.as_arrays(setup.args), problem.zero_control(x0)
     K = problem.set_at(t0, args)
