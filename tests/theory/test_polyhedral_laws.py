@@ -315,6 +315,47 @@ def test_bounds_along_trajectories_of_coupled_laws_are_proved_hold_and_are_sharp
     assert (np.asarray(bound.x) <= 20.0 * of_x + 1e-5).all()
 
 
+UNKNOWN = {
+    "a normal that turns": lambda t, args: sets.HalfSpace(
+        jnp.array([1.0, -0.5]) + 0.3 * jnp.sin(t), 0.2
+    ),
+    "a factor that moves": lambda t, args: sets.Scaled(sets.Simplex(1.0), 1.5 + 0.5 * jnp.sin(t)),
+    "a set that moves in a scaled one": lambda t, args: sets.Scaled(
+        sets.Simplex(1.5 + 0.5 * jnp.sin(t)), 2.0
+    ),
+    "smooth bounds of two rows": lambda t, args: sets.Polyhedron(
+        jnp.array([[1.0, 0.5], [-0.5, 1.0]]), 0.3 * jnp.sin(t) * jnp.ones(2)
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", mostly_thorough(UNKNOWN, ["a normal that turns"]))
+def test_sets_whose_motion_has_no_bound_are_sampled(name):
+    """With constants a run takes about as many steps as without, and the bound is finite."""
+    problem = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=UNKNOWN[name],
+        f=lambda t, x, u, args: jnp.sum(u) + 0.0 * x, control_space=dvax.spaces.Euclidean(2),
+        h=lambda t, x, u, args: jnp.stack([x[0] + jnp.sin(2.0 * t), -x[0] + jnp.cos(t)]),
+    )  # fmt: skip
+    constants = dvax.verify(problem, jnp.ones(1), 0.0, 2.0).constants
+    sol = dvax.solve(
+        problem, jnp.ones(1), 0.0, 2.0, ts=[2.0], constants=constants, method=dvax.ETD2RK()
+    )
+    bound = dvax.bound_error(problem, sol, constants)
+    assert not sol.enclosed and bound.status == "estimated"
+    assert float(bound.x[-1]) < 1e-3
+
+
+def test_limits_of_a_product_are_those_of_its_parts():
+    parts = sets.Simplex(jnp.array([1.0, 2.0]), sizes=(2, 1)), sets.HalfSpace(jnp.ones(2), 0.5)
+    K, like = sets.Product(*parts), (jnp.zeros(3), jnp.zeros(2))
+    R = rows(K, like)
+    found = limits(K, R, like)
+    assert R.shape == (6, 5) and [len(v) for v in found] == [6, 6, 6]
+    np.testing.assert_array_equal(found.high[3:], [1.0, 2.0, 0.5])
+
+
 @once
 def affine_law():
     """x' = Ax + u, u = x + c on {y : ⟨a, y⟩ = b}: a linear system."""

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
 from ..programs.enclosure import LinearEnclosure, enclose, is_enclosure
@@ -69,7 +70,11 @@ def _change(q: LinearEnclosure) -> LinearEnclosure:
 
 def rounding_of(K: AbstractSet, space: AbstractSpace, *places: Any) -> jax.Array:
     """Return a bound on the errors of projections y of z onto K, at places with both."""
-    size = jnp.max(jnp.stack([space.norm(at.z) + space.norm(at.y) for at in places]))
+    sizes = [
+        (space.norm(at.z) + space.norm(at.y)) * (1.0 if at.face is None else at.face.condition)
+        for at in places
+    ]
+    size = jnp.max(jnp.stack([v.astype(_tree.dtype(places[0].z)) for v in sizes]))
     is_iterated = any(isinstance(s, Polyhedron | ConstrainedBox) for s in sets_in(K))
     eps = float(jnp.finfo(size.dtype).eps)
     return (eps**_ITERATED if is_iterated else _ROUNDINGS * eps) * size

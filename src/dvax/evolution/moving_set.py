@@ -16,7 +16,7 @@ from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
 from ..programs.enclosure import LinearEnclosure, NoEnclosure, enclose
-from ..programs.structure import affine_between_knots, independent
+from ..programs.structure import between_knots, independent
 from ..sets._library import is_of_library
 from ..sets._motion import Entries, Fixed, Independent, Sum, Unbounded, describe
 from ..spaces import AbstractSpace
@@ -60,8 +60,9 @@ def has_bounded_motion(
 ) -> bool:
     """Return whether the code of K proves that `motion` is finite where the data of K are smooth.
 
-    A matrix, a normal or a factor must not move. Rows that share unknowns have a bound only if their
-    limits are lines between knots."""
+    A matrix, a normal or a factor must not move, and tables must have the argument t, or their knots
+    are not known. Rows that share unknowns have a bound only if their limits are lines between
+    knots."""
     K = problem.set_at(t, args)
     if K.intervals(like) is not None:
         return True
@@ -79,7 +80,11 @@ def has_bounded_motion(
 
         return of
 
-    return independent(arrays(Fixed), t) and affine_between_knots(arrays(Unbounded), t)
+    return (
+        independent(arrays(Fixed), t)
+        and between_knots(arrays(Entries), t).knows_knots
+        and all(between_knots(arrays(Unbounded), t))
+    )
 
 
 def _is_fixed(problem: Problem, args: Any, t: Any) -> bool:

@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 from .._jax.jaxprs import CUSTOM
 from .._tree import Tree
 from .interpreter import Domain, Rule, entered, interpret, same_for
-from .primitives import COMPARING, JOINING, LOGICAL, REARRANGING, STEPWISE, SUMMING
+from .primitives import COMPARING, JOINING, LOGICAL, REARRANGING, STEPWISE, SUMMING, TABLES
 from .smooth import SMOOTH
 
 
@@ -113,23 +113,43 @@ def independent_of_first(fn: Callable[..., Tree], first: Tree, *others: Tree) ->
     return all(out.degree == 0 for out in _read(program, inputs))
 
 
-def affine_between_knots(fn: Callable[[Any], Tree], t: Any) -> bool:
-    """Return whether the code of `fn` proves that fn(t) is affine in t between the times of the
-    constant and linear `dvax.signals.Table` in it.
+class BetweenKnots(NamedTuple):
+    """Proved properties of a function of time, where the times of its `dvax.signals.Table` are knots.
+
+    - `knows_knots`: every table is evaluated at t itself, so that its times are known as knots;
+    - `affine`: the function is affine in t between them."""
+
+    knows_knots: bool
+    affine: bool
+
+
+def between_knots(fn: Callable[[Any], Tree], t: Any) -> BetweenKnots:
+    """Return what the code of fn(t) proves.
 
     ```python
     >>> import dvax, jax.numpy as jnp
-    >>> from dvax.programs.structure import affine_between_knots
+    >>> from dvax.programs.structure import between_knots
     >>> load = dvax.signals.Table(jnp.array([0.0, 1.0, 2.0]), jnp.array([3.0, 5.0, 4.0]))
-    >>> affine_between_knots(lambda t: 2.0 * load(t) + t, 0.0)
-    True
-    >>> affine_between_knots(lambda t: load(t) ** 2, 0.0)
-    False
+    >>> between_knots(lambda t: 2.0 * load(t) + t, 0.0)
+    BetweenKnots(knows_knots=True, affine=True)
+    >>> between_knots(lambda t: load(0.5 * t) ** 2, 0.0)
+    BetweenKnots(knows_knots=False, affine=False)
 
     ```
     """
-    results = interpret(jax.make_jaxpr(fn)(t), [_Dependence(1, None, False)], _BETWEEN_KNOTS)
-    return all(out.degree <= 1 for out in map(_lift, results))
+    time, others = _Dependence(1, (0, ()), True), []
+
+    def table(eqn: Any, operands: list[_Dependence]) -> _Dependence:
+        *data, at = operands
+        if at.degree and at is not time:
+            others.append(eqn)
+        is_piecewise_linear = eqn.params["name"] != "dvax_cubic_table"
+        is_affine = is_piecewise_linear and not any(v.degree for v in data)
+        return _Dependence(at.degree if is_affine else 2, None, False)
+
+    domain = _DOMAIN._replace(rules={**RULES, **same_for(TABLES, table)})
+    results = interpret(jax.make_jaxpr(fn)(t), [time], domain)
+    return BetweenKnots(not others, all(out.degree <= 1 for out in map(_lift, results)))
 
 
 def _read(program: Any, inputs: list[_Dependence]) -> list[_Dependence]:
@@ -302,14 +322,4 @@ _DOMAIN = Domain(
     unknown=lambda eqn, operands: [_general(eqn, operands)] * len(eqn.outvars),
     apply=_apply,
     evaluate=_constant,
-)
-
-
-def _table(eqn: Any, operands: list[_Dependence]) -> _Dependence:
-    *data, t = operands
-    return _Dependence(2 if any(v.degree for v in data) else t.degree, None, False)
-
-
-_BETWEEN_KNOTS = _DOMAIN._replace(
-    rules={**RULES, **same_for({"dvax_constant_table", "dvax_linear_table"}, _table)}
 )

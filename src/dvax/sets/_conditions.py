@@ -91,8 +91,7 @@ def limits(K: AbstractSet, R: np.ndarray, like: Tree) -> Limits:
         return _equal(K.e)
     if isinstance(K, Simplex):
         positive = _between(jnp.zeros(_size(like)), jnp.full(_size(like), jnp.inf))
-        simplices = len(R) - _size(like)
-        of_each = np.shape(like)[:-1] if K.blocks is None else (simplices,)
+        of_each = np.shape(like)[:-1] if K.count is None else (K.count,)
         return _joined(positive, _equal(jnp.broadcast_to(K.total, of_each).reshape(-1)))
     assert isinstance(K, HalfSpace | Hyperplane)
     offset = jnp.reshape(K.offset, 1)

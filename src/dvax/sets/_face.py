@@ -7,7 +7,7 @@ of a set with the same aᵢ and other bounds. For every k in this set ⟨v, k �
 The multiplier of a condition that is not active is 0, and so is the slack of one that is.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,12 +37,15 @@ from .translated import Translated, full_offset
 
 
 class Face(NamedTuple):
-    """A projection y, the normal v there, and the multipliers and slacks of the conditions."""
+    """A projection y, the normal v there, and the multipliers and slacks of the conditions.
+
+    `condition`: at least the factor by which roundoff in active rows moves y, as far as it is known."""
 
     y: Tree
     v: Tree
     multipliers: tuple[Tree, ...]
     slacks: tuple[Tree, ...]
+    condition: Any = 1.0
 
 
 def is_polyhedral(K: AbstractSet) -> bool:
@@ -62,8 +65,9 @@ def face(K: AbstractSet, z: Tree, space: AbstractSpace) -> Face | None:
         spaces = space.spaces if isinstance(space, ProductSpace) else (space,) * len(K.parts)
         found = [face(k, leaf, s) for k, leaf, s in zip(K.parts, z, spaces, strict=True)]
         parts = [part for part in found if part is not None]
-        ys, vs, multipliers, slacks = zip(*parts, strict=True)
-        return Face(ys, vs, sum(multipliers, ()), sum(slacks, ()))
+        ys, vs, multipliers, slacks, conditions = zip(*parts, strict=True)
+        largest = jnp.max(jnp.stack([jnp.asarray(c, jnp.result_type(float)) for c in conditions]))
+        return Face(ys, vs, sum(multipliers, ()), sum(slacks, ()), largest)
     if isinstance(K, Translated):
         offset = full_offset(K, z)
         inner = face(K.set, _tree.sub(z, offset), space)
@@ -74,18 +78,18 @@ def face(K: AbstractSet, z: Tree, space: AbstractSpace) -> Face | None:
             return None
         y, v = (_tree.scale(K.factor, part) for part in inner[:2])
         size = jnp.abs(K.factor)
-        multipliers, slacks = (tuple(_tree.scale(size, a) for a in part) for part in inner[2:])
-        return Face(y, v, multipliers, slacks)
+        multipliers, slacks = (tuple(_tree.scale(size, a) for a in part) for part in inner[2:4])
+        return Face(y, v, multipliers, slacks, inner.condition)
     if isinstance(K, Hyperplane | AffineSubspace):
         y = K.project(z, space)
         return Face(y, _tree.sub(z, y), (), ())  # equations have no slacks
     if isinstance(K, HalfSpace):
         return _half_space(K, z, space)
     if isinstance(K, Polyhedron):
-        y, is_active, multiplier, slack = rows_at(K, z, space)
+        y, is_active, multiplier, slack, condition = rows_at(K, z, space)
         multiplier = jnp.where(is_active, multiplier, 0.0)
         slack = jnp.where(is_active, 0.0, jnp.maximum(slack, 0.0))
-        return Face(y, z - y, (multiplier,), (slack,))
+        return Face(y, z - y, (multiplier,), (slack,), condition)
     if isinstance(K, ConstrainedBox):
         return Face(*bounds_and_rows(K, z, space))
     if isinstance(K, Simplex):

@@ -183,8 +183,7 @@ def _simplex(
         totals = total[np.flatnonzero(np.diff(simplex, prepend=-1))]
     else:
         total = jnp.broadcast_to(jnp.max(K.total), like.shape)
-        count = sum(block.number.size for block in K.blocks)
-        totals = jnp.broadcast_to(K.total, (count,)) if jnp.ndim(K.total) == 0 else K.total
+        totals = jnp.broadcast_to(K.total, (K.count,))
     motion = _number(_heaviest(space) * totals)
     return Description(jnp.zeros_like(total), total, motion, [K.total])
 

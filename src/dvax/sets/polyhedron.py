@@ -106,7 +106,7 @@ class Polyhedron(AbstractSet):
 
         The multipliers of linearly dependent rows are not unique. A row without a bound has the
         slack 1."""
-        _, is_active, multiplier, slack = rows_at(self, z, space)
+        _, is_active, multiplier, slack, _ = rows_at(self, z, space)
         return [jnp.where(is_active, -multiplier, slack)]
 
     def _reduced(self, z: Tree, space: AbstractSpace) -> "_Reduced":
@@ -126,11 +126,13 @@ class Polyhedron(AbstractSet):
 
 def rows_at(K: Polyhedron, z: jax.Array, space: AbstractSpace) -> tuple[jax.Array, ...]:
     """Return the projection of z and, for each row of G, whether it is active, its multiplier and its
-    slack there. The rows have length one, without the part that the equations determine."""
+    slack there; and a bound on the factor by which roundoff in active rows moves y. Rows have length
+    one, without the part that the equations determine."""
     reduced = K._reduced(z, space)
-    y, active, multiplier, _ = _nearest(z.reshape(-1), *reduced)
+    y, active, multiplier, dual = _nearest(z.reshape(-1), *reduced)
     slack = reduced.bounds - times(reduced.rows, y / reduced.root - reduced.base)
-    return y.reshape(z.shape), active > 0, multiplier, slack
+    condition = jnp.maximum(1.0, _length(dual))
+    return y.reshape(z.shape), active > 0, multiplier, slack, condition
 
 
 class _Reduced(NamedTuple):

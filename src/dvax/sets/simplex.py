@@ -51,6 +51,7 @@ class Simplex(AbstractSet):
     blocks: tuple["_Block", ...] | None
     position: jax.Array | None
     entries: int | None = eqx.field(static=True)
+    count: int | None = eqx.field(static=True)
 
     def __init__(self, total: Any, sizes: Sequence[int] | np.ndarray | None = None):
         name = "dvax.sets.Simplex(total)"
@@ -65,9 +66,10 @@ class Simplex(AbstractSet):
         if not _tree.is_concrete(self.total):
             # A traced total: replace a negative one by NaN, so that an empty set stops a solve.
             self.total = jnp.where(self.total >= 0, self.total, jnp.nan)
-        self.blocks, self.position, self.entries = None, None, None
+        self.blocks, self.position, self.entries, self.count = None, None, None, None
         if sizes is not None:
             self.blocks, self.position, self.entries = _blocks(sizes, jnp.shape(self.total))
+            self.count = len(sizes)
 
     def project(self, z: Tree, space: AbstractSpace) -> Tree:
         inverse_w = None if has_uniform_weight(space) else inverse_weights(space, z)
