@@ -8,6 +8,8 @@ from tests.once import once
 
 import dvax
 from dvax import sets
+from dvax.evolution.enclosed_projection import rounding_of
+from dvax.evolution.interpolated_response import Place
 from dvax.sets._face import face
 
 N = 6
@@ -99,6 +101,33 @@ def test_slacks_of_a_set_with_other_data_bound_its_products_with_a_normal(name):
         products = [space.inner(first.v, k - other.y) for k in (far, *_points(pair[1], rng, space))]
         assert max(products) <= gap + 1e-7
         np.testing.assert_allclose(products[0], gap, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["constrained box", "polyhedron"])
+def test_error_of_a_projection_is_below_its_rounding_for_rows_that_are_nearly_parallel(kind):
+    """y₁ = 0.1 and y₁ + a y₂ = 0.1 + 0.7a for smaller and smaller a."""
+    space = dvax.spaces.Euclidean(3)
+
+    @jax.jit
+    def projected(a, z):
+        R = jnp.stack([jnp.array([1.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0]).at[1].set(a)])
+        e = jnp.stack([0.1, 0.1 + 0.7 * a])
+        if kind == "polyhedron":
+            K = sets.Polyhedron(jnp.concatenate([R, -R]), jnp.concatenate([e, -e]))
+        else:
+            K = sets.ConstrainedBox(-5.0, 5.0, R, e, e)
+        found = face(K, z, space)
+        return found.y, rounding_of(K, space, Place(z, found.y, found))
+
+    largest = 0.0
+    for a in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+        for z in np.random.default_rng(0).normal(size=(10, 3)):
+            y, rounding = projected(a, z)
+            error = np.linalg.norm(y - np.array([0.1, 0.7, z[2]]))
+            assert error <= float(rounding)
+            largest = max(largest, error)
+    assert kind == "polyhedron" or largest > 1e-7, "the rounding need not depend on a"
 
 
 def _points(K, rng, space):

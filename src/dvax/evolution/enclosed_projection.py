@@ -30,9 +30,9 @@ from ..sets._library import sets_in
 from ..spaces import AbstractSpace
 from .moving_set import Motion
 
-_ROUNDINGS, _ITERATED = 256.0, 0.75
-"""Error of a projection relative to the size of z and y: in units of ε, or as a power of ε where active
-sets are iterated."""
+_ROUNDINGS, _ITERATED, _ROWS = 256.0, 0.75, 4.0
+"""Error of a projection relative to the size of z and y: in units of ε, or, where active sets are
+iterated, in units of a power of ε."""
 
 
 def by_its_rules(
@@ -77,7 +77,7 @@ def rounding_of(K: AbstractSet, space: AbstractSpace, *places: Any) -> jax.Array
     size = jnp.max(jnp.stack([v.astype(_tree.dtype(places[0].z)) for v in sizes]))
     is_iterated = any(isinstance(s, Polyhedron | ConstrainedBox) for s in sets_in(K))
     eps = float(jnp.finfo(size.dtype).eps)
-    return (eps**_ITERATED if is_iterated else _ROUNDINGS * eps) * size
+    return (_ROWS * eps**_ITERATED if is_iterated else _ROUNDINGS * eps) * size
 
 
 def gap(faces: tuple[Face, Face], scales: tuple[jax.Array, jax.Array]) -> jax.Array:

@@ -19,6 +19,8 @@ from .abstract import AbstractSet
 
 _DAMPING = 64.0
 """Multiple of eps that is added to the diagonal of the Newton matrix, relative to its largest value."""
+_DEPENDENT = 1e-8
+"""Singular value of rows of length one below which they count as dependent."""
 _LINE_SEARCH = 400
 """Maximum number of points of a line search. Bisection alone needs about 60, and more for a maximiser
 much nearer than the end of the search."""
@@ -146,11 +148,11 @@ class ConstrainedBox(AbstractSet):
 
 def bounds_and_rows(
     K: ConstrainedBox, z: jax.Array, space: AbstractSpace
-) -> tuple[jax.Array, jax.Array, tuple[jax.Array, ...], tuple[jax.Array, ...]]:
-    """Return the projection y, the normal v there, and the multipliers and slacks of the upper and the
-    lower bounds and of both ends of the rows."""
+) -> tuple[jax.Array, jax.Array, tuple[jax.Array, ...], tuple[jax.Array, ...], jax.Array]:
+    """Return the projection y, the normal v there, the multipliers and slacks of the upper and the
+    lower bounds and of both ends of the rows, and how roundoff in active rows moves y."""
     z, inverse_w, lower, upper, R, low, high = data = K._data(z, space)
-    y, mu, _, shifted = _nearest(*data)
+    y, mu, free, shifted = _nearest(*data)
     beyond, sums = shifted - y, times(R, y)  # normal to the box
     multipliers = tuple(
         jnp.maximum(sign * a, 0.0) for a in (beyond / inverse_w, mu) for sign in (1.0, -1.0)
@@ -160,7 +162,21 @@ def bounds_and_rows(
         is_held = is_active | (low == high) | (slack <= _tolerance(y, R, low, high))
         of_rows.append(jnp.where(is_held, 0.0, slack))
     slacks = upper - y, y - lower, *of_rows
-    return y, beyond + inverse_w * combine(mu, R), multipliers, slacks
+    condition = _condition(R, (mu != 0.0) | (low == high), free, jnp.sqrt(inverse_w))
+    return y, beyond + inverse_w * combine(mu, R), multipliers, slacks, condition
+
+
+def _condition(R: jax.Array, is_active: jax.Array, free: jax.Array, root: jax.Array) -> jax.Array:
+    """Return 1/σ for the smallest singular value σ of the active rows of length one, on the entries at
+    no bound. Rows that depend on others up to roundoff are left out, as the projection does."""
+    scaled = R * root[None, :]
+    lengths = jnp.sqrt(jnp.sum(scaled * scaled, axis=1))
+    scaled = (
+        scaled * (jnp.where(is_active, 1.0, 0.0) / jnp.where(lengths > 0, lengths, 1.0))[:, None]
+    )
+    chosen = _largest(is_active.astype(jnp.int32), min(*R.shape, MAX_ROWS))
+    sizes = jnp.linalg.svd(scaled[chosen] * free[None, :], compute_uv=False)
+    return 1.0 / jnp.min(jnp.where(sizes > _DEPENDENT, sizes, 1.0), initial=1.0)
 
 
 class _State(NamedTuple):
