@@ -173,3 +173,17 @@ def test_reset_may_return_whole_numbers_but_must_be_finite():
         at_half(lambda t, x, u, args: x * jnp.nan)
     with pytest.raises(dvax.InputError, match="None"):
         dvax.solve(clock(), 0.0, 0.0, 1.0, events=[dvax.Event(lambda t, x, u, args: None)])
+
+
+@pytest.mark.parametrize("x0", [0.0, 1.0])
+def test_reset_that_is_not_finite_is_named_at_the_start_as_well(x0):
+    """x' = −1 reaches 0 at t = x0, where the reset is log(−1)."""
+    falling = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 9.0),
+        f=lambda t, x, u, args: -1.0 + 0.0 * x, h=lambda t, x, u, args: -x,
+    )  # fmt: skip
+    reset = dvax.Event(lambda t, x, u, args: x, reset=lambda t, x, u, args: jnp.log(x - 1.0))
+    with pytest.raises(dvax.SolveError, match="reset of an event returned NaN") as failure:
+        dvax.solve(falling, x0, 0.0, 2.0, events=[reset])
+    assert failure.value.solution.result == dvax.RESULTS.event_nonfinite
+    np.testing.assert_allclose(failure.value.solution.stats["t"], x0, atol=1e-9)

@@ -72,6 +72,9 @@ def by_steps(
         assert end.watched is not None
         rows, count = end.watched.rows, end.watched.count
         events = outlined(EventWatch.finish, watch, flow, rows, count, stops[0], setup.x0)
+        # A reset at t0 comes before the steps, which look for it.
+        is_broken = _tree.all_finite(setup.x0) & ~_tree.all_finite(x0)
+        result = RESULTS.where(is_broken, RESULTS.event_nonfinite, result)
         if saved is None:
             end, t1, complete = _to_event(end, events, t1, complete)
     guess = end.solver_state.guess
