@@ -15,6 +15,7 @@ holds with M = 1 and c = μ: d/dt‖x_h − x‖ ≤ μ‖x_h − x‖ + δ. The
 ‖u_h − u‖ ≤ L‖x_h − x‖ + ‖u_h − u_{x_h}‖.
 """
 
+import dataclasses
 import operator
 from typing import Any
 
@@ -139,6 +140,8 @@ def continue_bound(problem: Problem, sol: Solution, constants: Constants, before
     the pieces have one semigroup.
     """
     problem = current(problem)
+    # A solution that was read from a file does not know its x0.
+    before = dataclasses.replace(before, last=None)
     _check(problem, sol, constants, before)
     if before.integrals is None:
         return bound_by_constants(problem, sol, constants, before)

@@ -233,6 +233,7 @@ class _Reached:
         """Return arrays and facts; of the bound its last row."""
         assert isinstance(self.error, Bound)
         bound = {f.name: getattr(self.error, f.name) for f in fields(self.error)}
+        bound["last"] = None  # it is the state of the run
         rows = {name: v for name, v in bound.items() if isinstance(v, jax.Array | np.ndarray)}
         main, other = self.main, self.other
         arrays = [main.x, other.x, self.defect, *(np.asarray(v)[-1:] for v in rows.values())]
@@ -251,9 +252,10 @@ class _Reached:
         main, other, defect, *rows = saved.arrays
         bound: dict[str, Any] = dict.fromkeys((f.name for f in fields(Bound)), None)
         bound |= zip(about["bound"], map(jnp.asarray, rows), strict=True)
+        bound |= {"status": about["bound_status"], "why": about.get("why", ""), "last": main}
         return _Reached(
             _Piece(main, about["dt"][0]), _Piece(other, about["dt"][1]), float(about["apart"]),
-            Bound(**bound | {"status": about["bound_status"], "why": about.get("why", "")}), defect[()],
+            Bound(**bound), defect[()],
             about["frames"], about["steps"], about["rejected"], about["method"], about["status"],
             about["files"],
         )  # fmt: skip
