@@ -173,17 +173,15 @@ def _simplex(
     K: Simplex, pattern: AbstractSet | None, like: jax.Array, space: AbstractSpace
 ) -> Description:
     """An entry rises at most by the share of the change of its total that its weight allows."""
-    if K.blocks is None:
-        total = jnp.broadcast_to(K.total[..., None], like.shape)
+    if K.count is None:
         totals = jnp.broadcast_to(K.total, like.shape[:-1])  # one for each simplex that shares it
-    elif isinstance(pattern, Simplex) and pattern.blocks is not None:
-        numbers = np.concatenate([np.asarray(b.number).reshape(-1) for b in pattern.blocks])
-        simplex = numbers[np.asarray(pattern.position)]
-        total = jnp.broadcast_to(K.total, (simplex[-1] + 1,))[simplex]
-        totals = total[np.flatnonzero(np.diff(simplex, prepend=-1))]
+        total = jnp.broadcast_to(K.total[..., None], like.shape)
     else:
-        total = jnp.broadcast_to(jnp.max(K.total), like.shape)
         totals = jnp.broadcast_to(K.total, (K.count,))
+        total = jnp.broadcast_to(jnp.max(totals), like.shape)
+        if isinstance(pattern, Simplex) and pattern.blocks is not None:
+            numbers = np.concatenate([np.asarray(b.number).reshape(-1) for b in pattern.blocks])
+            total = totals[numbers[np.asarray(pattern.position)]]
     motion = _number(_heaviest(space) * totals)
     return Description(jnp.zeros_like(total), total, motion, [K.total])
 
