@@ -32,8 +32,12 @@ class _Case(NamedTuple):
 
 def run(full: bool) -> Section:
     cases = [
-        make() for make in (_van_der_pol, _stiff_van_der_pol, _spring, _pendulum, _fishery, _lorenz)
-    ]
+        make()
+        for make in (
+            _van_der_pol, _stiff_van_der_pol, _spring, _pendulum, _fishery, _lorenz, _routes,
+            _dispatch, _polygon, _disk,
+        )
+    ]  # fmt: skip
     tolerances = _TOLERANCES if full else _TOLERANCES[1:2]
     return Section(
         title="bounds: dvax.bound_error(problem, sol) without constants",
@@ -98,10 +102,10 @@ def _second(call: Callable[[], Any]) -> tuple[Any, float]:
     return result, time.perf_counter() - started
 
 
-def _problem(f: Any, h: Any, K: Any, A: Any = None) -> dvax.Problem:
+def _problem(f: Any, h: Any, K: Any, A: Any = None, shape: Any = ()) -> dvax.Problem:
     return dvax.Problem(
         A=dvax.generators.Scalar(0.0) if A is None else A, P=dvax.operators.Scaling(1.0), K=K, f=f, h=h,
-        control_space=dvax.spaces.Euclidean(()),
+        control_space=dvax.spaces.Euclidean(shape),
     )  # fmt: skip
 
 
@@ -160,3 +164,53 @@ def _lorenz() -> _Case:
         lambda t, x, u, args: -x[1], dvax.sets.Box(-10.0, 10.0),
     )  # fmt: skip
     return _Case("Lorenz, limited force", problem, jnp.array([1.0, 1.0, 20.0]), 8.0)
+
+
+def _routes() -> _Case:
+    """Drivers learn the times of five routes; the demand rises and falls with the day."""
+    free = jnp.array([1.0, 1.2, 1.5, 1.1, 2.0])
+    problem = _problem(
+        lambda t, x, u, args: 2.0 * (free + 0.3 * u + 0.1 * u**2 - x),
+        lambda t, x, u, args: -x - 0.2 * jnp.tanh(u) + 0.1 * jnp.sin(jnp.roll(u, 1)),
+        lambda t, args: dvax.sets.Simplex(3.0 + 2.0 * jnp.sin(0.5 * t)), shape=5,
+    )  # fmt: skip
+    return _Case("routes, moving simplex", problem, free, 24.0)
+
+
+def _dispatch() -> _Case:
+    """Four units meet a demand at the least cost; expected costs follow the output."""
+    problem = _problem(
+        lambda t, x, u, args: jnp.array([0.5, 1.0, 2.0, 4.0]) * u - x,
+        lambda t, x, u, args: -x - jnp.array([1.0, 0.0, 2.0, 0.5]),
+        lambda t, args: dvax.sets.ConstrainedBox(
+            0.0, jnp.array([1.5, 1.0, 2.0, 1.0]), jnp.ones((1, 4)),
+            jnp.stack([3.0 + 1.5 * jnp.sin(t)]), jnp.stack([3.0 + 1.5 * jnp.sin(t)]),
+        ), shape=4,
+    )  # fmt: skip
+    return _Case("dispatch, moving sum", problem, jnp.zeros(4), 8.0)
+
+
+def _polygon() -> _Case:
+    """A body in the plane is pulled into a polygon whose sides follow tables."""
+    angles = np.arange(5) * 2.0 * np.pi / 5.0
+    sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    times = np.arange(21.0)
+    widths = 1.0 + 0.3 * np.sin(times[:, None] + np.arange(5))
+    table = dvax.signals.Table(jnp.asarray(times), jnp.asarray(widths))
+    problem = _problem(
+        lambda t, x, u, args: jnp.concatenate([x[2:], 4.0 * (u - x[:2]) - 0.5 * x[2:]]),
+        lambda t, x, u, args: x[:2] + jnp.stack([jnp.sin(t), jnp.cos(0.7 * t)]),
+        lambda t, args: dvax.sets.Polyhedron(sides, table(t)), shape=2,
+    )  # fmt: skip
+    return _Case("body, polygon by tables", problem, jnp.array([1.0, 0.0, 0.0, 0.0]), 20.0)
+
+
+def _disk() -> _Case:
+    """A body is pulled into a disk that goes round and breathes."""
+    problem = _problem(
+        lambda t, x, u, args: 3.0 * (u - x), lambda t, x, u, args: x,
+        lambda t, args: dvax.sets.Ball(
+            jnp.stack([2.0 * jnp.cos(t), jnp.sin(2.0 * t)]), 0.6 + 0.3 * jnp.sin(3.0 * t)
+        ), shape=2,
+    )  # fmt: skip
+    return _Case("body, moving disk", problem, jnp.array([2.0, 0.0]), 20.0)
