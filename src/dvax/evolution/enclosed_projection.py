@@ -91,7 +91,7 @@ def gap(faces: tuple[Face, Face], scales: tuple[jax.Array, jax.Array]) -> jax.Ar
     return total
 
 
-def _product(mu: jax.Array, slack: jax.Array) -> jax.Array:
+def _product(mu: Any, slack: Any) -> jax.Array:
     """Return a multiplier times a slack, which may be infinite where the multiplier is 0, and negative
     by roundoff."""
     return jnp.where(mu > 0.0, mu * jnp.maximum(slack, 0.0), 0.0)

@@ -72,8 +72,8 @@ def has_bounded_motion(
     if describe(K, None, like, space) is None:
         return False
 
-    def arrays(kind: Any) -> Callable[[Any], list[jax.Array]]:
-        def of(t: Any) -> list[jax.Array]:
+    def arrays(kind: Any) -> Callable[[Any], list[Any]]:
+        def of(t: Any) -> list[Any]:
             found = describe(problem.set_at(t, args), None, like, space)
             assert found is not None
             return _arrays(found.motion, kind)
@@ -91,7 +91,7 @@ def _is_fixed(problem: Problem, args: Any, t: Any) -> bool:
     return independent(lambda t: jtu.tree_leaves(problem.set_at(t, args)), t)
 
 
-def _arrays(motion: Any, kind: Any) -> list[jax.Array]:
+def _arrays(motion: Any, kind: Any) -> list[Any]:
     """Return the data of this kind."""
     if isinstance(motion, Sum | Independent):
         return [v for part in motion.parts for v in _arrays(part, kind)]

@@ -51,7 +51,7 @@ def rows(K: AbstractSet, like: Tree) -> np.ndarray | None:
     return np.concatenate(matrices) if matrices else None
 
 
-def row_data(K: AbstractSet) -> list[jax.Array]:
+def row_data(K: AbstractSet) -> list[Any]:
     """Return the data of K on which its rows depend."""
     if isinstance(K, Product):
         return [data for part in K.parts for data in row_data(part)]
@@ -66,7 +66,7 @@ def row_data(K: AbstractSet) -> list[jax.Array]:
     return [_flat(K.normal, K.normal)] if isinstance(K, HalfSpace | Hyperplane) else []
 
 
-def limits(K: AbstractSet, R: np.ndarray, like: Tree) -> Limits:
+def limits(K: AbstractSet, R: Any, like: Tree) -> Limits:
     """Return the limits of a set with the rows R, which may move."""
     if isinstance(K, Product):
         found, row, column = [], 0, 0
@@ -119,15 +119,15 @@ def _flat(tree: Tree, like: Tree) -> jax.Array:
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jtu.tree_leaves(leaves)])
 
 
-def _between(low: jax.Array, high: jax.Array) -> Limits:
+def _between(low: Any, high: Any) -> Limits:
     return Limits(low, high, high - low)
 
 
-def _below(high: jax.Array) -> Limits:
+def _below(high: Any) -> Limits:
     return Limits(jnp.full_like(high, -jnp.inf), high, jnp.full_like(high, jnp.inf))
 
 
-def _equal(values: jax.Array) -> Limits:
+def _equal(values: Any) -> Limits:
     return Limits(values, values, jnp.zeros_like(values))
 
 

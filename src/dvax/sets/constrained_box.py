@@ -166,7 +166,7 @@ def bounds_and_rows(
     return y, beyond + inverse_w * combine(mu, R), multipliers, slacks, condition
 
 
-def _condition(R: jax.Array, is_active: jax.Array, free: jax.Array, root: jax.Array) -> jax.Array:
+def _condition(R: Any, is_active: Any, free: Any, root: Any) -> jax.Array:
     """Return 1/σ for the smallest singular value σ of the active rows of length one, on the entries at
     no bound. Rows that depend on others up to roundoff are left out, as the projection does."""
     scaled = R * root[None, :]

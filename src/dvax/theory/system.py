@@ -4,7 +4,6 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -143,9 +142,7 @@ def _block_or_none(*args: Any) -> Block | None:
         return None
 
 
-def limits_at(
-    problem: Problem, args: Any, R: np.ndarray | None, t: Any, like: Tree
-) -> tuple[jax.Array, ...]:
+def limits_at(problem: Problem, args: Any, R: Any, t: Any, like: Tree) -> tuple[Any, ...]:
     """Return both ends of a box K(t), or the limits of the rows R and their widths, as vectors; nothing
     for another set."""
     K = problem.set_at(t, args)
