@@ -5,6 +5,8 @@ takes seconds for a law that is solved by iteration, and a call costs more than 
 unknowns. The loops here can be part of one compiled function.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -71,12 +73,12 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array
     return rows[order, n:].reshape(right.shape), pivots
 
 
-def times(A: jax.Array, x: jax.Array) -> jax.Array:
+def times(A: Any, x: Any) -> jax.Array:
     """Return A x."""
     return A @ x if A.size > MAX_ROWS**2 else jnp.sum(A * x[None, :], axis=1)
 
 
-def combine(weights: jax.Array, rows: jax.Array) -> jax.Array:
+def combine(weights: Any, rows: Any) -> jax.Array:
     """Return Σₖ weightsₖ rowsₖ."""
     if rows.size > MAX_ROWS**2:
         return weights @ rows

@@ -116,7 +116,7 @@ def check_row_shapes(name: str, E: jax.Array, like: Tree) -> None:
         )
 
 
-def normalised_conditions(E: jax.Array, e: jax.Array) -> tuple[jax.Array, jax.Array]:
+def normalised_conditions(E: Any, e: Any) -> tuple[jax.Array, jax.Array]:
     """Return the same conditions as a matrix with rows of length one; zero rows are unchanged."""
     rows, scale = normalise_rows(E.reshape(E.shape[0], -1))
     return rows, e / scale
@@ -133,7 +133,7 @@ def has_solution(E: jax.Array, e: jax.Array) -> jax.Array:
     return jnp.all(jnp.isfinite(e)) & _is_solution(rows, values, y)
 
 
-def normalise_rows(rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+def normalise_rows(rows: Any) -> tuple[jax.Array, jax.Array]:
     """Return (rows scaled to length one, the scale factors); zero rows are unchanged."""
     # Divide by the largest entry first: the squares of very small entries would underflow.
     # The scale does not depend on it. Where XLA computes the rows twice, with other roundoff, none may
