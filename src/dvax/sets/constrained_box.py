@@ -286,7 +286,7 @@ def _largest(priority: jax.Array, width: int) -> Any:
     return slice(None) if width == len(priority) else lax.top_k(priority, width)[1]
 
 
-def _tolerance(y: jax.Array, R: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+def _tolerance(y: jax.Array, R: Any, low: Any, high: Any) -> jax.Array:
     """Return the violation of each row that counts as roundoff."""
     bound = jnp.maximum(
         jnp.where(jnp.isfinite(low), jnp.abs(low), 0.0),
