@@ -121,7 +121,7 @@ class ConstrainedBox(AbstractSet):
         of_rows = jnp.where(multiplier == 0, slack, -jnp.abs(multiplier))
         return [shifted - lower, upper - shifted, jnp.where(low == high, -1.0, of_rows)]
 
-    def _data(self, z: Tree, space: AbstractSpace) -> tuple[jax.Array, ...]:
+    def _data(self, z: Tree, space: AbstractSpace) -> tuple[Any, ...]:
         # Bounds given as Python numbers take the type of z.
         lower, upper = (
             jnp.broadcast_to(jnp.asarray(b, jnp.result_type(b, z)), z.shape)
