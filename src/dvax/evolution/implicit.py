@@ -153,7 +153,7 @@ def solve_by_implicit_steps(
 
 
 def _from_start(x0: Tree, t0: Any, given: tuple[Any, ...]) -> Tree:
-    """Return x0 as the state at a constant t0, whose tangent is −x'(t0) times that of t0."""
+    """Return x0 as the state at a constant t0: its tangent has the term −x'(t0) times that of t0."""
     row = Saved(t0[None], jtu.tree_map(lambda leaf: leaf[None], x0))
     row = with_tangents(row, lax.stop_gradient(row.t), *given)
     return jtu.tree_map(lambda leaf: leaf[0], row.x)

@@ -23,6 +23,8 @@ from ..spaces import AbstractSpace
 
 
 class Motion(NamedTuple):
+    """The `change` and the `deviation` of projections over a step."""
+
     change: jax.Array
     deviation: jax.Array
 
@@ -66,9 +68,10 @@ def has_bounded_motion(
     K = problem.set_at(t, args)
     if K.intervals(like) is not None:
         return True
-    if not is_of_library(K) or _is_fixed(problem, args, t):
-        return is_of_library(K)
-
+    if not is_of_library(K):
+        return False
+    if _is_fixed(problem, args, t):
+        return True
     if describe(K, None, like, space) is None:
         return False
 

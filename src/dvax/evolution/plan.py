@@ -117,7 +117,7 @@ class Plan(NamedTuple):
 
 def _is_enclosed(setup: Setup, plan: Plan) -> bool:
     """Return whether f̃ has an enclosure over a step in the way of a plan: its operations have rules,
-    the motion of K has a bound, and the moduli of a law without closed form are known."""
+    the motion of K has a bound, and the moduli of an interpolated response are known."""
     problem, x0, t0 = setup.problem, setup.x0, setup.number("t0")
     if plan.interpolated and not _MODULI <= set(setup.moduli):
         return False
