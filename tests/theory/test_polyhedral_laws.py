@@ -16,7 +16,7 @@ import dvax
 from dvax import sets
 from dvax.evolution.enclosed_projection import by_its_rules
 from dvax.evolution.interpolated_response import Place, interpolated, interpolated_projection
-from dvax.evolution.moving_set import Motion
+from dvax.evolution.moving_set import Motion, has_bounded_motion
 from dvax.programs.enclosure import LinearEnclosure, constant, straight
 from dvax.sets._conditions import Limits, limits, rows
 from dvax.sets._face import face
@@ -345,6 +345,21 @@ def test_sets_whose_motion_has_no_bound_are_sampled(name):
     bound = dvax.bound_error(problem, sol, constants)
     assert not sol.enclosed and bound.status == "estimated"
     assert float(bound.x[-1]) < 1e-3
+
+
+@pytest.mark.parametrize("shift", [None, 0.5])
+@pytest.mark.parametrize(
+    "K", [lambda b: sets.Simplex(2.0 + b), lambda b: sets.Polyhedron(jnp.eye(2), b * jnp.ones(2))]
+)
+def test_motion_by_a_table_has_a_bound_if_its_times_are_known(K, shift):
+    load = table(np.random.default_rng(0))
+    at = lambda t: t if shift is None else t + shift  # noqa: E731
+    problem = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=lambda t, args: K(load(at(t))),
+        f=lambda t, x, u, args: u, h=lambda t, x, u, args: x,
+    )  # fmt: skip
+    like, space = jnp.zeros(2), dvax.spaces.Euclidean(2)
+    assert has_bounded_motion(problem, None, jnp.zeros(()), like, space) == (shift is None)
 
 
 def test_limits_of_a_product_are_those_of_its_parts():
