@@ -5,6 +5,7 @@ dependence that is only a type is still a dependence.
 """
 
 import ast
+import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -311,3 +312,23 @@ def test_undeclared_third_party_import_is_detected(tmp_path: Path):
         "dvax.app.runs.store",
         "dvax.sets.box",
     ]
+
+
+@pytest.mark.slow
+def test_a_plain_solve_and_its_bound_import_neither_scipy_nor_diffrax() -> None:
+    """Together they take as long to import as JAX."""
+    code = (
+        "import sys, dvax, jax\n"
+        "jax.config.update('jax_enable_x64', True)\n"
+        "problem = dvax.Problem(\n"
+        "    A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),\n"
+        "    K=dvax.sets.Box(0.0, 0.5), f=lambda t, x, u, args: 3.0 - 0.5 * x - u,\n"
+        "    h=lambda t, x, u, args: 1.0 - 2.0 * x - u,\n"
+        ")\n"
+        "sol = dvax.solve(problem, -1.0, 0.0, 2.0)\n"
+        "bound = dvax.bound_error(problem, sol, dvax.verify(problem, -1.0, 0.0, 2.0).constants)\n"
+        "slow = [name for name in ('scipy', 'diffrax', 'optimistix') if name in sys.modules]\n"
+        "print(float(bound.x[0]) < 1e-3, slow)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.stdout.split("\n")[0] == "True []", done.stdout + done.stderr

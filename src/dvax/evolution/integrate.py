@@ -12,7 +12,7 @@ from .._failure import nan_derivatives_where
 from .closures import closure_convert
 from .event_arguments import checked_events
 from .flow import Flow
-from .implicit import Implicit, solve_by_implicit_steps
+from .implicit import Implicit
 from .method import AbstractMethod
 from .outcome import Outcome
 from .picard import Picard, solve_by_windows
@@ -59,6 +59,8 @@ def _run(setup: Setup, flow: Flow, ts: Any, valid: jax.Array, options: Options) 
     stops = jnp.concatenate([t0[None], knots, t1[None]])
     times = None if ts is None else jnp.where(valid, jnp.asarray(ts, setup.dtype), jnp.nan)
     if isinstance(method, Implicit):
+        from .implicit_steps import solve_by_implicit_steps  # Diffrax is slow to import
+
         return solve_by_implicit_steps(setup, method, flow, stops, times, options)
     if isinstance(method, Picard):
         return solve_by_windows(setup, method, flow, stops, times, options)

@@ -43,7 +43,6 @@ from .method import AbstractMethod
 from .nonfinite import nonfinite_data
 from .picard import Picard
 from .piecewise.method import PiecewiseLinear
-from .piecewise.propagate import propagate
 from .results import RESULTS, is_success
 from .rows import cut
 from .setup import Options, Setup
@@ -111,7 +110,7 @@ def solve(
       saved time, for the exact x0: steps are chosen, in a few runs, until `dvax.bound_error` with
       these `constants` says so (`rtol` and `atol` are then not used). The bound that was reached is
       in `stats["certified_bound"]`, or in `stats["estimated_bound"]` where the defect was sampled and
-      not enclosed (`sol.enclosed`): methods of order above 2, and sets that move but are no boxes. A
+      not enclosed (`sol.enclosed`): methods of order above 2, and sets whose motion has no rule. A
       tolerance out of reach is refused after one cheap run, with the least bound in reach and what
       limits it.
       Constants of a region hold while x and u stay in it. This is checked at 256 more times;
@@ -222,6 +221,8 @@ def _run(choice: Choice, setup: Setup, times: Any, options: Options, throw: bool
     """
     method, problem = choice.method, setup.problem
     if isinstance(method, PiecewiseLinear):
+        from .piecewise.propagate import propagate  # SciPy is slow to import
+
         solution = propagate(setup, times, options)
         solution.stats["method"] = choice.text()
         if throw and solution.result != RESULTS.successful:

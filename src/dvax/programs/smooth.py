@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import erf, erfc
 
 Ends = tuple[Any, Any]
 Bounds = Callable[[jax.Array, jax.Array], Ends]
@@ -37,6 +36,18 @@ class Smooth(NamedTuple):
 
 
 _EVERYWHERE = (-math.inf, math.inf)
+
+
+def _erf(v: Any) -> Any:
+    from scipy.special import erf  # a slow import that only this function and the next one need
+
+    return erf(v)
+
+
+def _erfc(v: Any) -> Any:
+    from scipy.special import erfc
+
+    return erfc(v)
 
 
 def _size(low: jax.Array, high: jax.Array) -> jax.Array:
@@ -266,10 +277,10 @@ SMOOTH: dict[str, Smooth] = {
         (0.0, 2.0 * math.atanh(3**-0.5)), symmetric=True,
     ),
     "erf": _peaked(
-        erf, _gauss, lambda xp, v: 2.0 * v * _gauss(xp, v), (0.0, 2**-0.5), symmetric=True
+        _erf, _gauss, lambda xp, v: 2.0 * v * _gauss(xp, v), (0.0, 2**-0.5), symmetric=True
     ),
     "erfc": _peaked(
-        erfc, lambda xp, v: -_gauss(xp, v), lambda xp, v: 2.0 * v * _gauss(xp, v), (0.0, 2**-0.5),
+        _erfc, lambda xp, v: -_gauss(xp, v), lambda xp, v: 2.0 * v * _gauss(xp, v), (0.0, 2**-0.5),
         symmetric=True,
     ),
     "square": integer_power(2),

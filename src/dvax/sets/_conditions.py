@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import scipy.linalg
 
 from .._small_matrices import times
 from .._tree import Tree
@@ -33,6 +32,8 @@ def rows(K: AbstractSet, like: Tree) -> np.ndarray | None:
     """Return R of a set with concrete data, for elements shaped like `like`, or None for a set without
     a rule here."""
     if isinstance(K, Product):
+        import scipy.linalg  # a slow import that only this function needs
+
         parts = [rows(k, leaf) for k, leaf in zip(K.parts, like, strict=True)]
         known = [part for part in parts if part is not None]
         return scipy.linalg.block_diag(*known) if len(known) == len(parts) else None

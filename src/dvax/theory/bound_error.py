@@ -32,7 +32,7 @@ def bound_error(
     10⁻⁹ to 10⁻⁵, and the distance of `sol` from this run is added: `sol` may be of any method.
     `x_paper` is then the bound that the constants of each piece give with the bound at its start, and
     `x_sharp` is `x`. With more than 128 unknowns errors grow at the rates of these constants. Where
-    `ETD2RK` samples its defect, as for a set that moves and is no box, the bound is an estimate.
+    `ETD2RK` samples its defect, as for a set whose motion has no rule, the bound is an estimate.
 
     If the solve did not record its defect (fixed steps), or the bounds of its trajectory (for constants
     of a region that were not passed to it), the problem is solved again with the same steps, and the

@@ -20,7 +20,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 
 from ..errors import input_error
 from ..programs.slope import TooLarge
@@ -189,6 +188,8 @@ def _minimise(
 ) -> np.ndarray | None:
     """Return the z that minimises its last entry subject to cones(z) + offsets ⪰ 0 and positive entries
     at `positive`, with linear functions `cones`; None if the solver finds none."""
+    import scipy.sparse as sp  # a slow import that only this function needs
+
     clarabel = _solver()
     units = [cones(e) for e in np.eye(size)]
     rows, offset, kinds = [], [], []

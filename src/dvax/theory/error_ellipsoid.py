@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from ..programs.slope import Values
 from .blocks import eigenvalues, norms
@@ -162,6 +161,8 @@ def propagate(
 
 def _scales(linear: Linearisation) -> Values:
     """Return scales with which the entries of C and R on both sides of the diagonal are of one size."""
+    import scipy.linalg  # a slow import that only this function needs
+
     sizes = np.mean(np.abs(linear.C) + linear.R, axis=0)
     off = sizes - np.diag(np.diag(sizes))
     largest = float(off.max(initial=0.0))

@@ -32,7 +32,7 @@ from dvax.app.plots.store import Variable
 from dvax.app.plots.theme import unit_text
 from dvax.app.runs.applications.base import Figure
 from dvax.app.runs.applications.config import OWN, ModelConfig, check_config
-from dvax.app.runs.applications.segments import join_pieces, segment_length, segments
+from dvax.app.runs.applications.segments import join_pieces, padded, segment_length, segments
 from dvax.app.runs.keys import set_key
 from dvax.app.runs.toml_file import read_toml
 from dvax.errors import input_error
@@ -183,7 +183,7 @@ def _solved(
     # A single time has no piece.
     for piece in segments(plan, parts=_PARTS) if len(plan.times) > 1 else ():
         check()
-        end = join_pieces([piece], length)
+        end = padded(piece, length)
         bound = model.bound(end, bound)
         rows.append(model.rows(end, bound, len(piece.ts)))
         pieces.append(piece)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.special
+from numpy.polynomial import legendre
 
 Array = np.ndarray
 
@@ -63,7 +63,18 @@ def _lobatto(count: int) -> Array:
     return 0.5 - 0.5 * np.cos(np.pi * np.arange(count + 1) / count)
 
 
-POINTS = np.append(0.5 + 0.5 * scipy.special.roots_jacobi(STAGES - 1, 1, 0)[0], 1.0)
+def _radau(stages: int) -> Array:
+    """Return the right Radau points of [0, 1], where the Legendre polynomials P_{s−1} and P_s of
+    [−1, 1] are equal."""
+    difference = np.append(np.zeros(stages - 1), [1.0, -1.0])
+    roots = np.sort(legendre.legroots(difference))[:-1]  # the last one is 1
+    derivative = legendre.legder(difference)
+    # A step of Newton's method takes the roundoff of the eigenvalues away.
+    roots -= legendre.legval(roots, difference) / legendre.legval(roots, derivative)
+    return np.append(0.5 + 0.5 * roots, 1.0)
+
+
+POINTS = _radau(STAGES)
 """The collocation points c in (0, 1]."""
 
 NODES = np.concatenate([[0.0], POINTS])

@@ -14,6 +14,7 @@ from dvax.app.runs.applications.segments import (
     end_of,
     from_checkpoint,
     join_pieces,
+    padded,
     segment_length,
     segments,
     to_checkpoint,
@@ -123,7 +124,7 @@ class ApplicationRun(AbstractRun):
         length = segment_length(self.plan)
 
         def compute() -> tuple[Any, ...]:
-            end = None if piece is None else join_pieces([piece], length)
+            end = None if piece is None else padded(piece, length)
             bound = self.model.bound(end, self.bound)
             return end, bound, self.model.rows(end, bound, count)
 

@@ -119,8 +119,7 @@ def from_checkpoint(saved: Checkpoint, like: Solution, plan: Plan) -> Solution:
 
 def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:
     """Join consecutive pieces to one solution: integrals of defects are accumulated and steps are
-    summed. Its `setup` is that of the first piece. With `count` the last row is repeated up to that
-    number, so that programs of one length serve all partial results."""
+    summed. Its `setup` is that of the first piece. With `count` it is padded to so many rows."""
     fields: dict[str, Any] = {}
     for name in ("ts", "xs"):
         fields[name] = _concatenate([getattr(piece, name) for piece in pieces])
@@ -149,20 +148,24 @@ def join_pieces(pieces: list[Solution], count: int | None = None) -> Solution:
         if name in last
     }
     fields["stats"] = {**last, **counts}
-    if count is not None:
-        length = count
-
-        def whole(rows: Any) -> jax.Array:
-            return _padded(rows, length)
-
-        stats = fields.pop("stats")
-        fields = {**jtu.tree_map(whole, fields), "stats": stats}
-    return with_fields(pieces[0], fields | {"enclosed": all(piece.enclosed for piece in pieces)})
+    whole = with_fields(pieces[0], fields | {"enclosed": all(piece.enclosed for piece in pieces)})
+    return whole if count is None else padded(whole, count)
 
 
-def _padded(rows: Any, count: int) -> jax.Array:
-    rows = np.asarray(rows)
-    return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)]))
+def padded(solution: Solution, count: int) -> Solution:
+    """Return the solution with its last row repeated up to `count` rows, so that programs of one length
+    serve all partial results."""
+    missing = count - len(solution.ts)
+    if missing == 0:
+        return solution
+
+    def whole(rows: Any) -> jax.Array:
+        rows = np.asarray(rows)
+        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)]))
+
+    names = "ts", "xs", "defect", "law_defect", "completed_defect"
+    fields = {name: getattr(solution, name) for name in names} | {"law": solution.responses()}
+    return with_fields(solution, jtu.tree_map(whole, fields))
 
 
 def _concatenate(parts: list[Any]) -> Any:
