@@ -88,6 +88,8 @@ def test_data_files_must_lie_beside_the_configuration_unless_allowed(folder, tmp
     assert "there is no such file" in told
     (told,) = problems(written(inner, '[model]\nname = "market"\ndata = "no"\nstart_hour = 0\n'))
     assert "there is no such folder" in told
+    (told,) = problems(written(inner, text.format("C1 1 0 1u\\nR1 1 0 10")))
+    assert "this is the text of one" in told
 
 
 def test_data_errors_name_their_line(folder):

@@ -37,6 +37,9 @@ def locate(
 
     if not name or "\x00" in name or len(name) > MAX_NAME:
         raise refuse("this is no file name", "Name a file beside the configuration.")
+    if "\n" in name:
+        fix = "Save it as a file beside the configuration, and write its name here."
+        raise refuse("it must be the name of a file, and this is the text of one", fix)
     path = Path(name) if allow_outside and Path(name).is_absolute() else folder / name
     try:
         resolved = path.resolve()
