@@ -226,7 +226,7 @@ def _nearest(
         chosen = _largest(priority, width)
         used = is_active[chosen]
         rows = jnp.where(used[:, None], R[chosen], 0.0)
-        is_free = (s.y > lower) & (s.y < upper)
+        is_free = (s.shifted > lower) & (s.shifted < upper)
         scaled = rows * jnp.where(is_free, inverse_w, 0.0)[None, :]
         # Where all entries of a row are at their bounds, the dual function is linear up to the next
         # piece, however far that is: the step passes the pieces of all entries.
@@ -276,7 +276,9 @@ def _nearest(
     end = lax.while_loop(unfinished, advance, check(jnp.zeros(m, z.dtype), z, 0))
     is_valid = end.over & jnp.all(jnp.isfinite(end.multiplier))
     is_valid &= jnp.all(lower <= upper) & jnp.all(low <= high)
-    is_free = (end.y > lower) & (end.y < upper)
+    # Not by y: XLA computes bounds that depend on t again for this comparison, possibly with other
+    # roundings than those to which y is equal.
+    is_free = (end.shifted > lower) & (end.shifted < upper)
     y = jnp.where(is_valid, end.y, jnp.nan)
     return y, end.multiplier, is_free.astype(z.dtype), end.shifted
 

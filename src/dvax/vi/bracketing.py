@@ -71,13 +71,9 @@ class Bracketing(AbstractSolver):
         guess = jtu.tree_map(jnp.clip, lax.stop_gradient(y0), lower, upper)
         brackets, count = _find_roots(_values_and_slopes(vi.F), lower, guess, upper, self.max_steps)
 
-        roots = [root(p) for p in brackets]
-        y, Fy, slope = (jtu.tree_structure(guess).unflatten(part) for part in zip(*roots))
+        roots = zip(*map(root, brackets), strict=True)
+        y, Fy, slope, at_bound = map(jtu.tree_structure(guess).unflatten, roots)
         # At an active bound −F ∈ N_K, so w = 0 there; at every other point w = F.
-        at_bound = jtu.tree_map(
-            lambda yi, f, lo, up: ((yi <= lo) & (f >= 0)) | ((yi >= up) & (f <= 0)),
-            y, Fy, lower, upper,
-        )  # fmt: skip
         w = jtu.tree_map(lambda f, active: jnp.where(active, 0.0, f), Fy, at_bound)
         # At an active bound z is a Newton step from y towards the root of F beyond the bound.
         z = jtu.tree_map(
@@ -101,25 +97,22 @@ def _find_roots(
 ) -> tuple[list[Brackets], jax.Array]:
     """Return the brackets of every leaf, and the number of iterations until all are closed."""
     leaves, tree = jtu.tree_flatten(guess)
-    values = zip(leaves, *F(guess), jtu.tree_leaves(lower), jtu.tree_leaves(upper), strict=True)
-    initial = [begin(*point) for point in values]
+    ends = zip(leaves, jtu.tree_leaves(lower), jtu.tree_leaves(upper), strict=True)
+    whole = [begin(*point) for point in ends]
 
-    # XLA would recompute the trial point, and F there, for each of the seven arrays of a bracket. So
-    # the trial point is computed one iteration ahead and carried, and F is evaluated in a branch that
-    # is always taken: XLA does not duplicate computations across a branch.
+    # XLA would recompute F for each of the seven arrays of a bracket, possibly with other roundings, so
+    # that its sign would not be the same for all of them. So the trial points and F there are carried
+    # into the iteration that narrows the brackets.
     def body(state: tuple) -> tuple:
-        brackets, at, count, running = state
-        values = lax.cond(running, F, lambda y: (jtu.tree_leaves(y),) * 2, tree.unflatten(at))
+        brackets, at, values, count, _ = state
         brackets = [narrow(p, *new) for p, *new in zip(brackets, at, *values, strict=True)]
-        at = [trial(p, count + 1) for p in brackets]
-        return brackets, at, count + 1, _any(is_open, brackets)
+        running = _any(is_open, brackets) & (count < max_steps)
+        at = [trial(p, count) for p in brackets]
+        values = lax.cond(running, F, lambda y: (jtu.tree_leaves(y),) * 2, tree.unflatten(at))
+        return brackets, at, values, jnp.where(running, count + 1, count), running
 
-    first_trial = [trial(p, 0) for p in initial]
-    brackets, _, count, _ = lax.while_loop(
-        lambda s: s[3] & (s[2] < max_steps),
-        body,
-        (initial, first_trial, jnp.asarray(0), _any(is_open, initial)),
-    )
+    start = whole, leaves, F(guess), jnp.asarray(0), jnp.asarray(True)
+    brackets, _, _, count, _ = lax.while_loop(lambda s: s[-1], body, start)
     return brackets, count
 
 

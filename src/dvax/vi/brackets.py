@@ -44,15 +44,13 @@ class Brackets(NamedTuple):
     slow: jax.Array
 
 
-def begin(x: Any, f: Any, s: Any, lower: Any, upper: Any) -> Brackets:
-    """Return the bracket with the guess x ∈ [lower, upper] as one end; the other has no value."""
-    unknown = jnp.full_like(x, jnp.nan)
-    lower, upper = jnp.broadcast_to(lower, x.shape), jnp.broadcast_to(upper, x.shape)
-    start = Brackets(
-        lower.astype(x.dtype), unknown, unknown, upper.astype(x.dtype), unknown, unknown,
-        jnp.zeros(x.shape, jnp.int8),
-    )  # fmt: skip
-    return narrow(start, x, f, s)
+def begin(like: Any, lower: Any, upper: Any) -> Brackets:
+    """Return the whole interval, whose ends have no values yet, for points shaped like `like`."""
+    unknown = jnp.full_like(like, jnp.nan)
+    ends = (jnp.broadcast_to(end, like.shape).astype(like.dtype) for end in (lower, upper))
+    return Brackets(
+        *(v for a in ends for v in (a, unknown, unknown)), jnp.zeros(like.shape, jnp.int8)
+    )
 
 
 def narrow(p: Brackets, x: Any, f: Any, s: Any) -> Brackets:
@@ -113,13 +111,19 @@ def best(p: Brackets) -> tuple[jax.Array, jax.Array, jax.Array]:
     return tuple(jnp.where(lower_end, q, r) for q, r in ((p.a, p.b), (p.fa, p.fb), (p.sa, p.sb)))  # pyright: ignore[reportReturnType]
 
 
-def root(p: Brackets) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return `best`, moved to the bound if the bracket closed there without a sign change."""
+def root(p: Brackets) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Return `best`, moved to the bound if the bracket closed there without a sign change, and whether
+    it did.
+
+    A comparison of x with the bound would be no test: XLA computes a bound that depends on t again
+    where it is used, possibly with other roundings.
+    """
     x, f, s = best(p)
     closed = _is_closed(p)
-    x = jnp.where(closed & jnp.isnan(p.fb) & (f < 0), p.b, x)
-    x = jnp.where(closed & jnp.isnan(p.fa) & (f > 0), p.a, x)
-    return x, f, s
+    at_upper = closed & jnp.isnan(p.fb) & (f < 0)
+    at_lower = closed & jnp.isnan(p.fa) & (f > 0)
+    x = jnp.where(at_upper, p.b, jnp.where(at_lower, p.a, x))
+    return x, f, s, at_upper | at_lower
 
 
 def is_open(p: Brackets) -> jax.Array:
