@@ -307,7 +307,8 @@ def _reason(
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return (
             f"{traced} a NumPy function requires",
-            "Use jax.numpy: `import jax.numpy as jnp`, and jnp.sin(x) for np.sin(x)",
+            "Use jax.numpy: `import jax.numpy as jnp`, and jnp.sin(x) for np.sin(x). For values at "
+            "given times, use dvax.signals.Table",
         )
     if isinstance(error, jax.errors.TracerIntegerConversionError):
         return (
@@ -317,7 +318,8 @@ def _reason(
     if isinstance(error, jax.errors.ConcretizationTypeError):
         return (
             f"{traced} float(), int() or a function of `math` requires",
-            "Remove float(); write jnp.sin(x) for math.sin(x)",
+            "Remove float() or int(); write jnp.sin(x) for math.sin(x), and dvax.signals.Table for "
+            "values at given times",
         )
     if isinstance(error, jax.errors.UnexpectedTracerError):
         return (

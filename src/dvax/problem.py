@@ -490,7 +490,9 @@ def _tuple_of_numbers(x: Tree) -> InputProblem:
 
 def _shape_fix(name: str, out: Tree, element: Tree, space: str) -> str:
     if isinstance(out, list | tuple) and not isinstance(element, tuple):
-        return f"Join the components: return jnp.stack([...]) from {name}"
+        numbers = all(jnp.ndim(part) == 0 for part in jax.tree_util.tree_leaves(out))
+        joined = "jnp.stack([...])" if numbers else "jnp.concatenate([jnp.ravel(a), ...])"
+        return f"Join the components: return {joined} from {name}"
     shape = getattr(out, "shape", None)
     if space == "state":
         like_x = shape is not None and len(shape) == len(getattr(element, "shape", ()))

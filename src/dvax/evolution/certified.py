@@ -365,7 +365,8 @@ def _out_of_reach(
         f"{_amount(M * _convolved(rate, span), 'M Φ_c(T) = ')} over T = {span:g}, and the least "
         f"bound in reach here is {_amount(reachable, 'about ')} ({why})",
         "Choose a larger certified_tol, solve for a shorter time, or find sharper constants: "
-        "dvax.verify gives a one-sided rate where possible",
+        "dvax.verify gives a one-sided rate where possible. dvax.bound_error(problem, sol), without "
+        "constants, proves a bound along the trajectory, which is often much smaller",
     )
 
 

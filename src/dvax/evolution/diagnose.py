@@ -55,6 +55,7 @@ _LATER = 1e-3
 """Share of the run after which K is looked at again where it becomes empty."""
 
 _REFUSED = "refused: "
+_OF_X = ("A x", "h", "f")
 _NEAREST = "the point of K nearest to 0"
 _CHECKED = {name: f"Check {name} there" for name in ("K", "h", "f")} | {
     "A x": "Check A, and how large x becomes",
@@ -68,7 +69,9 @@ def failure(solution: Any) -> SolveError:
     stats, result = solution.stats, solution.result
     diagnosis = diagnose(solution)
     reached = f"Stopped at t = {float(stats['t']):.17g} after {int(stats['steps'])} steps."
-    parts = ("" if diagnosis.replaces_result else RESULTS[result], diagnosis.cause, reached)
+    # A law whose f or h is NaN is not at fault.
+    shown = RESULTS.nonfinite if diagnosis.is_nonfinite else result
+    parts = ("" if diagnosis.replaces_result else RESULTS[shown], diagnosis.cause, reached)
     return SolveError(" ".join(part for part in parts if part), solution, diagnosis.fixes)
 
 
@@ -177,7 +180,9 @@ def _nonfinite(stop: Stop) -> Diagnosis:
                 return Diagnosis(f"{name} is refused {at}: {what[len(_REFUSED) :]}.", fixes, True)
             if name == _NEAREST:
                 return Diagnosis(f"K is empty {at}: {name} is {what}.", fixes, True)
-            return Diagnosis(f"{name} is {what} {at}.", fixes)
+            x = _tree.add(stop.x, _tree.scale(stop.time(high), velocity))
+            where = f"{at}, x = {_tree.short(x)}" if name in _OF_X else at
+            return Diagnosis(f"{name} is {what} {where}.", fixes, is_nonfinite=name in _OF_X)
         last_good = float(ahead)
     return Diagnosis()
 

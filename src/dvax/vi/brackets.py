@@ -47,10 +47,9 @@ class Brackets(NamedTuple):
 def begin(like: Any, lower: Any, upper: Any) -> Brackets:
     """Return the whole interval, whose ends have no values yet, for points shaped like `like`."""
     unknown = jnp.full_like(like, jnp.nan)
-    ends = (jnp.broadcast_to(end, like.shape).astype(like.dtype) for end in (lower, upper))
-    return Brackets(
-        *(v for a in ends for v in (a, unknown, unknown)), jnp.zeros(like.shape, jnp.int8)
-    )
+    a, b = (jnp.broadcast_to(end, like.shape).astype(like.dtype) for end in (lower, upper))
+    slow = jnp.zeros(like.shape, jnp.int8)
+    return Brackets(a, unknown, unknown, b, unknown, unknown, slow)
 
 
 def narrow(p: Brackets, x: Any, f: Any, s: Any) -> Brackets:

@@ -105,7 +105,7 @@ def test_lead_calls_well_posedness_by_its_weakest_assumption(status: str) -> Non
     rows = (AssumptionRow("a", "", "proved", ""), AssumptionRow("b", "", status, ""))
     told = lead(run(assumptions=rows))[-1]
     assert told.startswith(f"Well-posedness is {status}: ")
-    shown = "all 2 assumptions" if status == "proved" else f"1 is proved, 1 is {status} (b)"
+    shown = "all 2 needed assumptions" if status == "proved" else f"1 is proved, 1 is {status} (b)"
     assert shown in told and told.endswith("The model is in the class exactly.")
 
 
@@ -117,7 +117,7 @@ def test_lead_gives_the_reason_of_a_refuted_assumption() -> None:
     told = lead(run(assumptions=rows))[-1]
     assert told.startswith(
         "An assumption of well-posedness is refuted: h is continuous in t (h jumps at t = 6). For the "
-        "others, all 1 assumption of the theory are proved."
+        "others, all 1 needed assumption are proved."
     )
 
 
@@ -125,7 +125,7 @@ def test_lead_ignores_sufficient_conditions_that_are_not_needed() -> None:
     rows = (
         AssumptionRow("a", "", "proved", ""), AssumptionRow("b", "", "refuted", "", is_required=False),
     )  # fmt: skip
-    assert "Well-posedness is proved: all 1 assumption" in lead(run(assumptions=rows))[-1]
+    assert "Well-posedness is proved: all 1 needed assumption" in lead(run(assumptions=rows))[-1]
 
 
 def test_lead_falls_back_to_the_constants() -> None:

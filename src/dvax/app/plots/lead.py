@@ -123,9 +123,9 @@ def _well_posed(run: RunRecord) -> str:
         # A sufficient condition that fails does not refute what follows from it; the reason is stated.
         failing = "; ".join(f"{r.statement} ({r.why})" for r in rows if r.status == "refuted")
         others = {row.label: row.status for row in rows if row.status != "refuted"}
-        rest = f" For the others, {_tally(others, 'assumption')}" if others else ""
+        rest = f" For the others, {_tally(others, 'needed assumption')}" if others else ""
         return f"An assumption of well-posedness is refuted: {failing}.{rest}{_fit(run)}"
-    statuses, noun = {row.label: row.status for row in rows}, "assumption"
+    statuses, noun = {row.label: row.status for row in rows}, "needed assumption"
     if not rows:
         statuses, noun = {row.name: row.status for row in run.constants}, "constant"
     if not statuses:
@@ -145,14 +145,14 @@ def _tally(statuses: Mapping[str, str], noun: str) -> str:
     for label, status in statuses.items():
         groups.setdefault(status, []).append(label)
     if set(groups) == {"proved"}:
-        return f"all {counted(len(statuses), noun)} of the theory are proved."
+        return f"all {counted(len(statuses), noun)} are proved."
     parts = [
         f"{len(groups[status])} {'is' if len(groups[status]) == 1 else 'are'} {status}"
         + _named(status, groups[status])
         for status in (*ORDER, *sorted(set(groups) - set(ORDER)))
         if status in groups
     ]
-    return f"of {counted(len(statuses), noun)} of the theory {', '.join(parts)}."
+    return f"of {counted(len(statuses), noun)} {', '.join(parts)}."
 
 
 def _named(status: str, labels: Sequence[str]) -> str:

@@ -33,6 +33,11 @@ _REMEDY_ALONG = (
     "smaller: docs/models/own-problem.md says how."
 )
 
+_REMEDY_NOT_FOLLOWED = (
+    "bound_steps = 0 in [model] asks for a bound by constants. Leave it out for one that is proved "
+    "along the trajectory."
+)
+
 
 def _number_or_text(value: Any) -> float | str | None:
     """Check the end of a run, whose unit is known when the model is built."""
@@ -123,6 +128,8 @@ class PythonApplication(AbstractModelApplication):
         self.follower: BoundAlong | str = ""
         if self.is_followed:
             self.remedy = _REMEDY_ALONG
+        elif not by_constants and is_small:
+            self.remedy = _REMEDY_NOT_FOLLOWED
         self.whole, self.bound_unit = model.figures is not None, _bound_unit(model)
         if table.energy:
             with problems.collect():
