@@ -16,7 +16,7 @@ import dvax
 from dvax import sets
 from dvax.evolution.enclosed_projection import by_its_rules
 from dvax.evolution.interpolated_response import Place, interpolated, interpolated_projection
-from dvax.evolution.moving_set import Motion, has_bounded_motion
+from dvax.evolution.moving_set import Motion, has_bounded_motion, motion
 from dvax.programs.enclosure import LinearEnclosure, constant, straight
 from dvax.sets._conditions import Limits, limits, rows
 from dvax.sets._face import face
@@ -507,3 +507,17 @@ def test_runs_with_constants_end_in_single_precision(name):
     assert sol.enclosed and bound.status == "proved" and int(sol.stats["steps"]) < 500
     error = np.linalg.norm(np.asarray(sol.xs[-1], float) - sharp.xs[-1])
     assert error <= float(bound.x[-1]) <= 0.05
+
+
+def test_a_polyhedron_that_moves_along_lines_changes_by_an_unknown_distance():
+    def found(rate):
+        problem = dvax.Problem(
+            A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), f=lambda t, x, u, args: u,
+            K=lambda t, args: sets.Polyhedron(np.eye(2), (1.0 + rate * t) * np.ones(2)),
+            h=lambda t, x, u, args: x,
+        )  # fmt: skip
+        t = LinearEnclosure(jnp.asarray(0.0), jnp.asarray(0.5), jnp.asarray(0.0))
+        return motion(problem, None, t, jnp.zeros(2), dvax.spaces.Euclidean(2))
+
+    assert found(1.0) == (np.inf, 0.0)
+    assert found(0.0) == (0.0, 0.0)

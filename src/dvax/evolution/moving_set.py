@@ -116,9 +116,9 @@ def _distance(motion: Any, part: Any, zero: jax.Array) -> jax.Array:
         return sum((_distance(v, part, zero) for v in motion.parts), zero)
     if isinstance(motion, Independent):
         return jnp.sqrt(sum((_distance(v, part, zero) ** 2 for v in motion.parts), zero))
-    # What must not move does not, and what has no bound may move along lines.
-    part = _deviation if isinstance(motion, Unbounded) else lambda q: _change(q) + _deviation(q)
-    moves = [jnp.any(part(q) > 0.0) for q in motion.arrays]
+    # What must not move does not. What has no bound may move along lines, by an unknown distance.
+    both = (part,) if isinstance(motion, Unbounded) else (_change, _deviation)
+    moves = [jnp.any(size(q) > 0.0) for q in motion.arrays for size in both]
     return jnp.where(jnp.any(jnp.stack(moves)), jnp.inf, zero) if moves else zero
 
 
