@@ -67,7 +67,8 @@ def _radau(stages: int) -> Array:
     """Return the right Radau points of [0, 1], where the Legendre polynomials P_{s−1} and P_s of
     [−1, 1] are equal."""
     difference = np.append(np.zeros(stages - 1), [1.0, -1.0])
-    roots = np.sort(legendre.legroots(difference))[:-1]  # the last one is 1
+    # Complex numbers without imaginary parts, from NumPy 2.5 on. The last root is 1.
+    roots = np.sort(legendre.legroots(difference).real)[:-1]
     derivative = legendre.legder(difference)
     # A step of Newton's method takes the roundoff of the eigenvalues away.
     roots -= legendre.legval(roots, difference) / legendre.legval(roots, derivative)
