@@ -129,7 +129,7 @@ class PythonApplication(AbstractModelApplication):
         if self.is_followed:
             self.remedy = _REMEDY_ALONG
         elif not by_constants and is_small:
-            self.remedy = _REMEDY_NOT_FOLLOWED
+            self.remedy = f"{_REMEDY_NOT_FOLLOWED} {self.remedy}"
         self.whole, self.bound_unit = model.figures is not None, _bound_unit(model)
         if table.energy:
             with problems.collect():
