@@ -122,6 +122,18 @@ FUNCTIONS = {
         lambda: of_f(lambda t, x, u, args: np.sin(x)),
         "newcomer.py, line; jnp.sin(x) for np.sin(x)",
     ),
+    "np.interp": (
+        lambda: of_f(lambda t, x, u, args: x + np.interp(t, np.arange(3.0), np.ones(3))),
+        "newcomer.py, line; dvax.signals.Table",
+    ),
+    "an entry by int(t)": (
+        lambda: of_f(lambda t, x, u, args: x + np.ones(3)[int(t)]),
+        "newcomer.py, line; Remove float() or int(); dvax.signals.Table",
+    ),
+    "parts of other shapes": (
+        lambda: of_f(lambda t, x, u, args: (x[:2], x[2]), x0=jnp.zeros(3)),
+        "Problem(f); jnp.concatenate([jnp.ravel(a), ...])",
+    ),
     "np.array": (
         lambda: of_f(lambda t, x, u, args: np.array([x[0], u[1]]), x0=jnp.zeros(2)),
         "jax.numpy",

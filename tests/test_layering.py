@@ -316,7 +316,7 @@ def test_undeclared_third_party_import_is_detected(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_plain_solve_and_its_bound_import_neither_scipy_nor_diffrax() -> None:
-    """Together they take as long to import as JAX."""
+    """They are slow to import, and few runs need them."""
     code = (
         "import sys, dvax, jax\n"
         "jax.config.update('jax_enable_x64', True)\n"

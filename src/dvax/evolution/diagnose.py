@@ -182,7 +182,7 @@ def _nonfinite(stop: Stop) -> Diagnosis:
                 return Diagnosis(f"K is empty {at}: {name} is {what}.", fixes, True)
             x = _tree.add(stop.x, _tree.scale(stop.time(high), velocity))
             where = f"{at}, x = {_tree.short(x)}" if name in _OF_X else at
-            return Diagnosis(f"{name} is {what} {where}.", fixes, is_nonfinite=name in _OF_X)
+            return Diagnosis(f"{name} is {what} {where}.", fixes, is_nonfinite=name in ("h", "f"))
         last_good = float(ahead)
     return Diagnosis()
 

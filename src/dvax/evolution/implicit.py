@@ -1,6 +1,6 @@
 """Implicit Runge–Kutta methods of Diffrax, applied to the whole right-hand side Ax + f̃(t, x).
 
-Diffrax takes as long to import as JAX, so only those who use it do.
+Diffrax is slow to import, so it is imported where a method is constructed.
 """
 
 from typing import TYPE_CHECKING

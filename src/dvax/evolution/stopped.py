@@ -19,7 +19,7 @@ class Diagnosis(NamedTuple):
     """A cause in one or two sentences ("" if there is no evidence), and fixes.
 
     If `replaces_result`, the cause also says what happened, so that the error omits the text of the
-    result. `is_nonfinite`: a function of the problem is NaN or infinite, whatever the result is.
+    result. `is_nonfinite`: f or h is NaN or infinite, whatever the result is.
     """
 
     cause: str = ""

@@ -58,6 +58,7 @@ def test_check_and_run_say_that_a_bound_certifies_no_digit_and_energy_makes_it_s
     file = written(tmp_path / "plain", BY_CONSTANTS)
     told = call("check", file)
     assert "may certify no digit" in told and "Try energy = true" in told
+    assert "bound_steps = 0 in [model] asks for a bound by constants" in told
     told = call("run", file, "-o", tmp_path / "run")
     assert "exceeds the norm of the solution, so that it certifies no digit" in told
     assert "energy = true" in told and "weights" in told and "troubleshooting.md" in told
