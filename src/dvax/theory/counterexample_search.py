@@ -170,7 +170,7 @@ def find_counterexample(system: System, region: Region) -> CounterexamplePair | 
 
     t, x, u = low
     ends = (t, x, u, u), (high[0], high[1], high[2], high[2])
-    candidates = _climb(violation, _points(*ends, 4 * _STARTS, 3), *ends)
+    candidates = _climb(violation, _points(*ends, 4 * _STARTS, 3, on_faces=True), *ends)
     forward, backward, length, norm_F = jax.vmap(products)(candidates)
     eps = float(jnp.finfo(length.dtype).eps)
     gain = jnp.minimum(forward, -backward) - _ROUNDING_FACTOR * eps * norm_F * length
@@ -193,16 +193,28 @@ def smallest_monotonicity(system: System, region: Region) -> float:
     low, high = _bounds(region)
 
     def negative_quotient(v: tuple) -> jax.Array:
-        t, x, u, w = v
+        t, x, u, direction, length = v
         K = system.problem.set_at(t, args)
         F = system.problem.frozen(t, x, args)
+        w = jtu.tree_map(
+            lambda p, e, a, b: jnp.clip(p + length.astype(e.dtype) * e, a, b),
+            u,
+            direction,
+            low[2],
+            high[2],
+        )
         y, z = K.project(P.apply(u), space), K.project(P.apply(w), space)
         d = _tree.sub(y, z)
         product, square = space.inner(_tree.sub(F(y), F(z)), d), space.inner(d, d)
+        # The rounding error of a product of near points.
+        eps = jnp.finfo(square.dtype).eps
+        product = product + 64 * eps * (space.norm(F(y)) + space.norm(F(z))) * space.norm(d)
         return jnp.where(square > 1e-12, -product / jnp.maximum(square, 1e-12), -jnp.inf)
 
-    ends = (*low, low[2]), (*high, high[2])
-    points = _climb(negative_quotient, _points(*ends, _STARTS, 4), *ends)
+    width = jtu.tree_map(jnp.subtract, high[2], low[2])
+    shortest, longest = jnp.asarray(1e-3), jnp.asarray(1.0)
+    ends = (*low, _tree.scale(-1.0, width), shortest), (*high, width, longest)
+    points = _climb(negative_quotient, _points(*ends, _STARTS, 4, on_faces=True), *ends)
     values = jax.vmap(negative_quotient)(points)
     return -float(jnp.max(jnp.where(jnp.isfinite(values), values, -jnp.inf)))
 
@@ -283,14 +295,19 @@ def _bounds(region: Region) -> tuple[Any, Any]:
     return next(ends), next(ends)
 
 
-def _points(low: Any, high: Any, count: int, seed: int) -> Any:
-    """Return random points, uniform in a box, including its centre and two corners."""
+def _points(low: Any, high: Any, count: int, seed: int, on_faces: bool = False) -> Any:
+    """Return random points, uniform in a box, including its centre and two corners. With `on_faces`,
+    about half of the entries of every second point lie at an end: monotone functions have their
+    extremes there."""
     rng = np.random.default_rng(seed)
     size = sum(leaf.size for leaf in jtu.tree_leaves(low))
     count = max(4, min(count, _MAX_ENTRIES // size))
 
     def draw(a: jax.Array, b: jax.Array) -> jax.Array:
         fraction = rng.random((count, *a.shape))
+        if on_faces:
+            ends = rng.integers(0, 4, fraction[::2].shape)
+            fraction[::2] = np.where(ends < 2, ends, fraction[::2])
         fraction[0], fraction[1], fraction[2] = 0.0, 1.0, 0.5
         low, high = np.asarray(a), np.asarray(b)
         return jnp.asarray(low + fraction * (high - low), a.dtype)

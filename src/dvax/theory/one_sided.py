@@ -16,16 +16,18 @@ B = F_u + τH_xᵀP, completing the square in v gives
 
 which is convex in τ. It keeps the sign of every feedback, whereas L̃ = α_f + β_f L adds absolute
 values. It needs only Lipschitz bounds of h and the convexity of K. For the contact law it is
-−(α + d_x − d_u b_x/(1 + b_u)), which is sharp. If the derivatives are enclosed within radii r, the
-additional terms are bounded with ‖v‖ ≤ L‖d‖ and added to μ.
+−(α + d_x − d_u b_x/(1 + b_u)), which is sharp. If the derivatives are enclosed within radii, those of
+F_x are added to G, and those of H_u subtracted from N, as diagonal matrices with a quadratic form that
+is no smaller; the other terms are bounded with ‖v‖ ≤ L‖d‖ and added to μ.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from ..programs.slope import TooLarge, Values
-from .blocks import Block, as_one_matrix, eigenvalues
+from .blocks import Block, as_one_matrix, diagonal, dominating, eigenvalues
 from .system import Jacobians, System
 
 _ITERATIONS = 60
@@ -60,48 +62,80 @@ def _minimise_mu(
     f_x, f_u, h_x, h_u, P = _with_equal_counts(f_x, f_u, h_x, h_u, P)
     if not all(np.isfinite(b.radius).all() for b in (f_x, f_u, h_x, h_u)):
         return np.inf
-    G = f_x.center + f_x.center.swapaxes(1, 2)
-    half_N = P.center @ (np.eye(h_u.center.shape[1]) - h_u.center)
-    N = half_N + half_N.swapaxes(1, 2)
+    G = _raised(_twice(f_x.center), _twice(f_x.radius))
+    N = _twice(P.center @ (np.eye(h_u.center.shape[1]) - h_u.center))
     cross = h_x.center.swapaxes(1, 2) @ P.center
+    # The other radii add at most ⟨R_u v, d⟩ + τ⟨S_x d + S_u v, Pv⟩, with ‖v‖ ≤ L‖d‖.
+    norm_P = float(system.spectrum.norm)
+    L = alpha_h * float(system.spectrum.norm_P_inv) / gamma if gamma > 0 else np.inf
+    radii = [b.radius_norms() for b in (f_u, h_x, h_u)]
+    if not pointwise:
+        # ‖v‖ ≤ L‖d‖ holds for all points together, not for each point.
+        radii = [np.broadcast_to(np.max(r), len(G)) for r in radii]
+
+    def rest(tau: Values, of_law: Values) -> Values:
+        of_u, of_x, _ = radii
+        if not (of_u.any() or of_x.any() or of_law.any()):
+            return np.zeros(len(G))
+        return of_u * L + tau * norm_P * L * (of_x + of_law * L)
+
+    def minimum(N: Values, of_law: Values) -> float:
+        return _minimum_over_tau(G, N, f_u.center, cross, partial(rest, of_law=of_law), pointwise)
+
+    least = minimum(N, radii[2])
+    if radii[2].any():
+        lowered = -_raised(-N, _twice(np.abs(P.center) @ h_u.radius))
+        least = min(least, minimum(lowered, np.zeros(len(G))))
+    return least + shift
+
+
+def _twice(stack: Values) -> Values:
+    """Return the sum of every matrix and its transpose."""
+    return stack + stack.swapaxes(1, 2)
+
+
+def _raised(center: Values, radius: Values) -> Values:
+    """Return matrices with a quadratic form no smaller than that of any in `center` ± `radius`, which
+    are symmetric: of the diagonals that can be added, each matrix gets that of least eigenvalue."""
+    if not radius.any():
+        return center
+    raised = np.stack([center + diagonal(e) for e in dominating(radius)])
+    best = np.argmin([eigenvalues(v)[:, -1] for v in raised], axis=0)
+    return raised[best, np.arange(len(center))]
+
+
+def _minimum_over_tau(
+    G: Values, N: Values, feedback: Values, cross: Values, rest: Callable[[Values], Values],
+    pointwise: bool,
+) -> float:  # fmt: skip
+    """Return the minimum of μ(τ) + `rest`(τ), or ∞ if N is not positive definite."""
     if not (eigenvalues(N)[:, 0] > 0).all():
         return np.inf
     inverse = np.linalg.inv(N)
-    # The radii add at most ⟨R_x d + R_u v, d⟩ + τ⟨S_x d + S_u v, Pv⟩, with ‖v‖ ≤ L‖d‖.
-    norm_P = float(system.spectrum.norm)
-    L = alpha_h * float(system.spectrum.norm_P_inv) / gamma if gamma > 0 else np.inf
-    radii = [b.radius_norms() for b in (f_x, f_u, h_x, h_u)]
-    if not pointwise:
-        # ‖v‖ ≤ L‖d‖ holds for all points together, not for each point.
-        radii = [np.max(r) for r in radii]
-    enclosed_only = any(np.any(r) for r in radii)
 
     def mu(log_tau: Values) -> Values:
         """Return μ for every matrix, with its own τ or a common one."""
         tau = np.exp(log_tau)
         factor = tau[:, None, None]
-        B = f_u.center + factor * cross
+        B = feedback + factor * cross
         S = G + B @ inverse @ B.swapaxes(1, 2) / factor
         S = 0.5 * (S + S.swapaxes(1, 2))
         values = 0.5 * eigenvalues(S)[:, -1] + _ROUNDING * np.abs(S).max(axis=(1, 2))
-        if enclosed_only:
-            a, b, c, e = radii
-            values = values + a + b * L + tau * norm_P * L * (c + e * L)
-        return values
+        return values + rest(tau)
 
     # No τ gives less than ½ λ_max(G). If feedback and coupling are opposite, B = 0 for one τ, which
     # reaches that value: two eigenvalue problems in the place of a search.
-    squares, products = (np.sum(v * cross, axis=(1, 2)) for v in (cross, f_u.center))
+    squares, products = (np.sum(v * cross, axis=(1, 2)) for v in (cross, feedback))
     if not pointwise:
         squares, products = (np.sum(v, keepdims=True) for v in (squares, products))
     if np.all(squares > 0) and np.all(products < 0):
         opposite = mu(np.log(-products / squares))
         least = 0.5 * eigenvalues(G)[:, -1]
         if np.max(opposite) <= np.max(least) + 10 * _ROUNDING * np.abs(G).max():
-            return float(np.max(opposite)) + shift
+            return float(np.max(opposite))
     if pointwise:
-        return float(np.max(_minimum(mu, len(G)))) + shift
-    return float(_minimum(lambda log_tau: np.max(mu(log_tau), keepdims=True), 1)[0]) + shift
+        return float(np.max(_minimum(mu, len(G))))
+    return float(_minimum(lambda log_tau: np.max(mu(log_tau), keepdims=True), 1)[0])
 
 
 def _with_equal_counts(*blocks: Block) -> list[Block]:
