@@ -104,6 +104,19 @@ def test_netcdf_opens_in_xarray_with_equal_values_and_cf_attributes(
         assert (units["time"], units["depth"], units["cells"]) == ("1", "mm", "1")
 
 
+def test_variables_keep_the_order_of_the_model_whatever_their_names(tmp_path):
+    names = ["tank two", "tank one", "inflow"]
+    time = base.Variable(("time",), np.arange(2.0), "s", "time")
+    rows = {"time": time, **{n: base.Variable(("time",), np.ones(2), "m", n) for n in names}}
+    (tmp_path / "run").mkdir()
+    store = open_store(tmp_path / "run" / "trajectory.zarr", 2, rows, {}, {})
+    store.write(time.values, {name: rows[name].values for name in names})
+    store.finish()
+    (tmp_path / "run" / "manifest.json").write_text(json.dumps({"status": "finished"}))
+    (path,) = export_run(tmp_path / "run", tmp_path / "a.csv")
+    assert rows_of(path)[0] == ["time [s]", *(f"{name} [m]" for name in names)]
+
+
 def test_npz_has_the_arrays_and_their_units_without_pickle(own, tmp_path):
     (path,) = export_run(own, tmp_path / "a.npz")
     data = stored(own)

@@ -268,7 +268,7 @@ def open_store(
     axis = next(iter(rows))
     coordinates = [name for name, v in every.items() if v.dims == (name,)]
     # A store lists its arrays in no order.
-    about = {**attrs, "coordinates": " ".join(coordinates), _ORDER: " ".join(every)}
+    about = {**attrs, "coordinates": " ".join(coordinates), _ORDER: list(every)}
     of_row = max(v.values.nbytes // max(1, len(v.values)) for v in rows.values())
     block = max(1, min(frames, _CHUNK_ROWS, _CHUNK_BYTES // max(1, of_row)))
 
