@@ -38,3 +38,10 @@ def test_a_single_number_or_a_space_before_it_parts_no_names_of_one_unit():
     assert titles_of_axes(picture) == {"level [m]"}
     (picture,) = drawn(**dict.fromkeys(("inner", "outer_2", "gap"), TIMES))
     assert titles_of_axes(picture) == {"value [m]"}
+
+
+def test_a_short_vector_has_a_curve_for_each_entry():
+    (picture,) = drawn(x=TIMES[:, None] * np.arange(1.0, 5.0))
+    curves = picture.interactive["data"]
+    assert [curve["name"] for curve in curves] == ["x[0]", "x[1]", "x[2]", "x[3]"]
+    assert titles_of_axes(picture) == {"x [m]"}

@@ -17,8 +17,8 @@ _CURVES, _MOST_CURVES = 6, 12
 
 
 def pictures(data: Mapping[str, Variable]) -> list[Picture]:
-    """Vectors as maps, series over time by their units, other arrays by their smallest, mean and
-    largest entries."""
+    """Long vectors as maps, series over time and short vectors as curves, other arrays by their
+    smallest, mean and largest entries."""
     time = data["time"]
     t, unit = time.values, time.unit
     numbered = Counter((v.unit, _numbered(name)) for name, v in data.items() if v.values.ndim == 1)
@@ -34,7 +34,9 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
             # One name with a number is a name as others.
             key = key if numbered[key] > 1 else (variable.unit, "")
             groups.setdefault(key, []).append((name, values))
-        elif values.ndim == 2 and len(t) > 1 and values.shape[1] > _CURVES:
+        elif values.ndim == 2 and values.shape[1] <= _CURVES:
+            arrays.append(_entries(t, name, values, variable.unit))
+        elif values.ndim == 2 and len(t) > 1:
             fields.append((name, values, Axis(name, variable.unit)))
         else:
             arrays.append(_extremes(t, name, values.reshape(len(t), -1), variable.unit))
@@ -57,6 +59,11 @@ def pictures(data: Mapping[str, Variable]) -> list[Picture]:
             )
         )  # fmt: skip
     return found
+
+
+def _entries(t: np.ndarray, name: str, values: np.ndarray, unit: str) -> Panel:
+    curves = [Curve(t, column, f"{name}[{k}]", k, DASHES[0]) for k, column in enumerate(values.T)]
+    return Panel(curves, name, unit)
 
 
 def _extremes(t: np.ndarray, name: str, values: np.ndarray, unit: str) -> Panel:
