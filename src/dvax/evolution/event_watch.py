@@ -27,6 +27,7 @@ from .._tree import Tree
 from .event import Event, Events
 from .event_search import RESTART, Walk, arrives, next_event, touches
 from .flow import Flow
+from .law_tolerance import one_direction
 from .outcome import Record
 from .results import RESULTS
 from .stepper import Stepper, dense_output, one_sided_time
@@ -43,7 +44,7 @@ _BRACKET = 1e-13
 _MIN_ULPS, _BRACKET_ULPS = 16, 4
 """The smallest values of these, in roundings of t."""
 
-_LEFT = 1e-3
+_LEFT = 1e-2
 """Distance from an event, in widths, at which g is taken to have its slope before the event."""
 
 _TOUCH = 2.0
@@ -51,6 +52,10 @@ _TOUCH = 2.0
 
 _ROUNDINGS = 1024.0
 """Roundings of the largest value of a function, below which its value is not told from zero."""
+
+_LAW_WINDOW, _LAW_ERRORS = 4.0, 300.0
+"""Errors of the law, in its tolerances, by which an event may lie before the end of a step that ends
+behind it, and within which its time is found again."""
 
 _ACCUMULATION = 8
 """Stops that follow each other by less than this many smallest distances are taken to accumulate."""
@@ -144,11 +149,23 @@ class EventWatch(eqx.Module):
         self, flow: Flow, t: Any, x: Tree, guess: Tree | None, inset: Any = 0.0
     ) -> jax.Array:
         """Return the values of all functions at t, with the response at t − `inset`."""
-        u = _response(flow, t - inset, x, guess)
+        return self._at(t, x, _response(flow, t - inset, x, guess), flow.args)
+
+    def _at(self, t: Any, x: Tree, u: Tree, args: Any) -> jax.Array:
         dtype = jnp.result_type(*jtu.tree_leaves(x))
         return jnp.stack(
-            [jnp.asarray(e.function(t, x, u, flow.args), dtype).reshape(()) for e in self.events]
+            [jnp.asarray(e.function(t, x, u, args), dtype).reshape(()) for e in self.events]
         )
+
+    def _law_error(self, flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
+        """Return by how much values differ with responses that all count as solved, as estimated from
+        their change along one direction; 0 where the law is not iterated."""
+        if not flow.iterates:
+            return jnp.zeros(len(self.events), jnp.result_type(*jtu.tree_leaves(x)))
+        y = flow.problem.zero_control(x) if guess is None else guess
+        values = lambda y: self._at(t, x, flow.operator.inverse(y), flow.args)  # noqa: E731
+        change = jax.jvp(values, (y,), (one_direction(y),))[1]
+        return flow.law_tol(t, x, y) * jnp.abs(change)
 
     def along_flow(
         self, flow: Flow, t: Any, x: Tree, guess: Tree | None, s: Any = 0.0
@@ -173,7 +190,9 @@ class EventWatch(eqx.Module):
     def begin(self, flow: Flow, t0: Any, x0: Tree) -> Watched:
         """Return the state of the watch before the first step from x0, behind the resets at t0."""
         own, there, t, x = jtu.tree_map(_constant, (self, flow, t0, x0))
-        values, slopes = own.along_flow(there, t, x, there.guess(x))
+        guess = there.guess(x)
+        values, slopes = own.along_flow(there, t, x, guess)
+        values = _beyond(own._law_error(there, t, x, guess), values)
         many, dtype = self.max_events, t0.dtype
         rows = Rows(
             jnp.full(many, jnp.inf, dtype),
@@ -252,11 +271,12 @@ class EventWatch(eqx.Module):
             x_after, shifts = self.jump(stepper.flow, end, x1, now, widths, guess)
             new = jtu.tree_map(_constant, x_after)
             values, slopes = own.along_flow(flow, t, new, guess)
+            values = _beyond(own._law_error(flow, t, new, guess), values)
             end_row = Rows(t, -1, number, True, widths, x1)
             table, total = self._put(rows, now, count, end_row)
             accumulates = at_end & (t - watched.stop <= _ACCUMULATION * _MIN_ULPS * _ulp(t))
             # After the reset g returned through zero at once, instead of passing it at constant slope.
-            crossed = now & (jnp.sign(values) == jnp.sign(reached))
+            crossed = now & (values != 0) & (jnp.sign(values) == jnp.sign(reached))
             bent = jnp.abs(values) < _STRAIGHT * jnp.abs(slopes * shifts)
             accumulates |= jnp.any(crossed & bent)
             after = inside._replace(
@@ -307,8 +327,11 @@ class EventWatch(eqx.Module):
             inside = jnp.where(is_last, before, 0.0)
             return self.values(stepper.flow, t, at_x(theta), guess, inside)
 
+        law_error = self._law_error(stepper.flow, end, at_x(1.0), guess)
+
         def at(theta: Any) -> tuple[jax.Array, jax.Array]:
-            return jax.jvp(values, (theta,), (jnp.ones_like(theta),))
+            value, slope = jax.jvp(values, (theta,), (jnp.ones_like(theta),))
+            return _beyond(law_error, value), slope
 
         touch = _TOUCH * (self.atol + self.rtol * watched.sizes)
         ulp = jnp.maximum(_ulp(t0), _ulp(end)) / h + jnp.finfo(t0.dtype).eps
@@ -321,11 +344,19 @@ class EventWatch(eqx.Module):
             near = touches(walk.va, walk.da, walk.vb, walk.db, walk.b - walk.a, *limits[:2])
             fired = walk.found & walk.above & (arrived | near)
             # In a short step, as from a kink to the next, g is rounded by more than it changes in it.
-            slope = jnp.minimum(jnp.abs(walk.da), jnp.abs(walk.db)) / h
-            rounded = rounding / jnp.where(slope == 0, jnp.inf, slope)
-            closest = jnp.max(jnp.where(fired & self._stops, rounded, 0.0))
-            window = jnp.clip(closest, _width(t0, end, _SMALLEST_WINDOW), width)
-            return fired, jnp.where(near & ~arrived, 0.0, width + rounded), window
+            flattest, steepest = (
+                of(jnp.abs(walk.da), jnp.abs(walk.db)) / h for of in (jnp.minimum, jnp.maximum)
+            )
+            time_of = lambda error, slope: error / jnp.where(slope == 0, jnp.inf, slope)  # noqa: E731
+            farthest = lambda times: jnp.max(jnp.where(fired & self._stops, times, 0.0))  # noqa: E731
+            window = jnp.clip(
+                farthest(time_of(rounding, flattest)), _width(t0, end, _SMALLEST_WINDOW), width
+            )
+            # Where g is constant behind the event, its slope is that before it.
+            of_law = time_of(law_error, steepest)
+            window = jnp.maximum(window, farthest(_LAW_WINDOW * of_law))
+            widths = jnp.minimum(width + time_of(rounding, steepest) + _LAW_ERRORS * of_law, h)
+            return fired, jnp.where(near & ~arrived, 0.0, widths), window
 
         def one(carry: tuple[Walk, Rows, Any]) -> tuple[Walk, Rows, Any]:
             walk, table, count = carry
@@ -420,27 +451,24 @@ class EventWatch(eqx.Module):
     def _shift(
         self, flow: Flow, t: Any, x: Tree, k: Any, fired: Any, width: Any, guess: Tree | None
     ) -> Any:
-        """Return s with g(t + s, Φ_s(x)) = 0 for event k: two steps of Newton's method from 0, or from
-        the left of the event if g is constant behind it, as where the law saturates.
+        """Return s with g(t + s, Φ_s(x)) = 0 for event k: three steps of Newton's method, all from the
+        left of the event, since g may be constant behind it, as where the law saturates.
 
         At an extremum that touches zero, and where g jumps, s is 0 and its derivatives are NaN.
         """
 
         reach = jnp.where(jnp.isfinite(width), width, 0.0)
 
-        def newton(k_step: Any, carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-            s, flat, _ = carry
+        def newton(left: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            s = carry[0] - left
             values, slopes = self.along_flow(flow, t, x, guess, s)
-            slope, first = slopes[k], k_step == 0
-            flat = jnp.where(first, slope == 0, flat)
-            zero = s - values[k] / jnp.where(slope == 0, 1.0, slope)
-            # At the zero g has two slopes. The last step starts left of it.
-            from_left = jnp.where(first, -reach, jnp.where(k_step == 1, zero - _LEFT * reach, zero))
-            return jnp.where(flat, from_left, zero), flat, slope != 0
+            slope = slopes[k]
+            return s - values[k] / jnp.where(slope == 0, 1.0, slope), slope != 0
 
         # The derivatives of two steps from the zero are those of the zero, up to the second.
-        start = jnp.zeros_like(t), jnp.asarray(False), jnp.asarray(True)
-        s, _, exists = lax.fori_loop(0, 3, newton, start)
+        start = jnp.zeros_like(t), jnp.asarray(True)
+        lefts = reach * jnp.asarray([1.0, _LEFT, _LEFT], t.dtype)
+        s, exists = lax.fori_loop(0, 3, lambda i, carry: newton(lefts[i], carry), start)
         exists &= jnp.abs(s) <= 2.0 * width
         s = jnp.where(fired & exists, s, 0.0)
         (s,) = nan_derivatives_if_used(fired & ~exists, [s], (flow, t, x))
@@ -496,6 +524,12 @@ def _constant(leaf: Any) -> Any:
 
 def _response(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Tree:
     return flow.operator.inverse(flow.rate(t, x, guess).y)
+
+
+def _beyond(error: Any, values: jax.Array) -> jax.Array:
+    """Return the values, and 0 within their error: there they have no sign, as those of a response that
+    stays at a bound."""
+    return jnp.where(jnp.abs(values) <= error, 0.0, values)
 
 
 def _flow_by(flow: Flow, t: Any, x: Tree, s: Any) -> Tree:

@@ -58,7 +58,7 @@ class LawTolerance(eqx.Module):
         """Return the tolerance at x, where `effect` is the derivative of f with respect to y = Pu."""
         gain = self.gain
         if gain is None:
-            gain = jnp.max(jnp.stack(self.sizes(effect(_direction(like)))))
+            gain = jnp.max(jnp.stack(self.sizes(effect(one_direction(like)))))
         allowed = self.atol + self.rtol * jnp.min(jnp.stack(self.sizes(x)))
         tol = jnp.minimum(allowed / jnp.where(gain > 0.0, gain, 1.0), self.most)
         # Solvers that do not know the size of their terms need a limit that they can reach.
@@ -80,7 +80,7 @@ def law_tolerance(setup: Setup) -> LawTolerance:
     )
 
 
-def _direction(like: Tree) -> Tree:
+def one_direction(like: Tree) -> Tree:
     """Return a fixed element of which neither sums nor differences of entries vanish."""
 
     def of_leaf(leaf: jax.Array) -> jax.Array:

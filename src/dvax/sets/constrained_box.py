@@ -338,6 +338,8 @@ def _line_search(
 
 def _nearest_jvp(primals: tuple, tangents: tuple) -> tuple:
     """The derivative of the projection onto the active bounds and rows, which are fixed."""
+    # A constant R may be an array of NumPy, which no traced index selects from.
+    primals = tuple(map(jnp.asarray, primals))
     y, multiplier, free, shifted = _nearest(*primals)
     sums = times(primals[4], y)
     least = _tolerance(y, *primals[4:])

@@ -17,6 +17,7 @@ from .region import Region
 from .set_motion import SetMotion, bounded_in_time, jumps, times
 from .status import Status, weakest
 from .system import System
+from .weights import roots
 
 _LARGEST_MAGNITUDE = 1e100
 """Bound on |x| and |u| that stands for every ball 𝔹_R(0) in floating-point arithmetic."""
@@ -221,21 +222,36 @@ def _moving_feedback(
         return Assumption(label, statement, "refuted", why, evidence=jump[0])
     try:
         enclosure = SlopeEnclosure(h, (jnp.zeros(()), system.x0, system.u0), (0,))
-        speed = 0.0
+        weights, speed = roots(system.control, system.u0), 0.0
         for piece in times(*span, knots):
-            for x in slopes(enclosure(piece, finite_region.x, finite_region.u).out):
-                for part in x.parts.values():
-                    fastest = np.abs(part.center) + part.radius
-                    # `max` would drop NaN.
-                    speed = float(np.maximum(speed, np.max(fastest, initial=0.0)))
+            out = slopes(enclosure(piece, finite_region.x, finite_region.u).out)
+            fastest = [_fastest(x, root) for x, root in zip(out, weights, strict=True)]
+            # `max` would drop NaN.
+            speed = float(np.maximum(speed, _length(np.array(fastest))))
         if np.isfinite(speed):
-            speed_text = f", |∂h/∂t| ≤ {speed:.6g}" if speed < 1e50 else ""
+            speed_text = f", ‖∂h/∂t‖ ≤ {speed:.6g}" if speed < 1e50 else ""
             return Assumption(
                 label, statement, "proved", f"by its code, Lipschitz in t{speed_text}"
             )
     except TooLarge:
         pass
     return Assumption(label, statement, "estimated", "no proof from the code of h")
+
+
+def _fastest(x: Slope, root: np.ndarray) -> float:
+    """Return a bound on the norm of the derivative in t, with the square root of the weights."""
+    entries = np.zeros(root.size)
+    for part in x.parts.values():
+        entries += (np.abs(part.center) + part.radius).ravel()
+    return _length(root * entries)
+
+
+def _length(entries: np.ndarray) -> float:
+    """Return the Euclidean norm without overflow of the squares."""
+    largest = float(np.max(entries, initial=0.0))
+    if not 0.0 < largest < np.inf:
+        return largest
+    return largest * float(np.linalg.norm(entries / largest))
 
 
 _ON_EACH_SIDE = "the theory holds on both sides of it"
