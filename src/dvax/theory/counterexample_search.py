@@ -28,6 +28,9 @@ _MAX_ENTRIES = 2_000_000
 _ROUNDING_FACTOR = 1e4
 """Assumed rounding error of F, in units of ε times its norm."""
 
+_NEAREST = 1e-6
+"""Smallest distance of two points whose products tell a sign."""
+
 _JUMP_HALVINGS = 70
 """Number of halvings of a segment, after which its ends are equal or neighbouring numbers."""
 
@@ -147,68 +150,44 @@ def find_counterexample(system: System, region: Region) -> CounterexamplePair | 
     none was found.
     """
     low, high = _bounds(region)
-    P, space, args = system.problem.operator(system.args), system.control, system.args
-
-    def points(v: tuple) -> tuple[Tree, Tree, Tree, Tree]:
-        t, x, u, w = v
-        K = system.problem.set_at(t, args)
-        y, z = K.project(P.apply(u), space), K.project(P.apply(w), space)
-        F = system.problem.frozen(t, x, args)
-        return y, z, F(y), F(z)
-
-    def products(v: tuple) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """Return ⟨F(y), z − y⟩, ⟨F(z), z − y⟩, ‖z − y‖ and ‖F(y)‖ + ‖F(z)‖."""
-        y, z, Fy, Fz = points(v)
-        d = _tree.sub(z, y)
-        forward, backward = space.inner(Fy, d), space.inner(Fz, d)
-        return forward, backward, space.norm(d), space.norm(Fy) + space.norm(Fz)
 
     def violation(v: tuple) -> jax.Array:
-        forward, backward, length, _ = products(v)
-        gain = jnp.minimum(forward, -backward)
-        return jnp.where(length > 1e-6, gain / jnp.maximum(length, 1e-6) ** 2, -jnp.inf)
+        products = _products(system, *v)
+        gain = jnp.minimum(products.forward, -products.backward)
+        near = products.length > _NEAREST
+        return jnp.where(near, gain / jnp.maximum(products.length, _NEAREST) ** 2, -jnp.inf)
 
-    t, x, u = low
-    ends = (t, x, u, u), (high[0], high[1], high[2], high[2])
+    ends = (*low, low[2]), (*high, high[2])
     candidates = _climb(violation, _points(*ends, 4 * _STARTS, 3, on_faces=True), *ends)
-    forward, backward, length, norm_F = jax.vmap(products)(candidates)
-    eps = float(jnp.finfo(length.dtype).eps)
-    gain = jnp.minimum(forward, -backward) - _ROUNDING_FACTOR * eps * norm_F * length
-    gain = jnp.where((length > 1e-6) & jnp.isfinite(gain), gain, -jnp.inf)
-    k = int(jnp.argmax(gain))
-    if not float(gain[k]) > 0:
-        return None
-    worst = jtu.tree_map(lambda leaf: leaf[k], candidates)
-    y, z, *_ = points(worst)
-    return CounterexamplePair(
-        float(worst[0]), worst[1], y, z, float(backward[k] / length[k] ** 2), float(forward[k]),
-        float(backward[k]),
-    )  # fmt: skip
+    return _first_pair(system, candidates)
 
 
-def smallest_monotonicity(system: System, region: Region) -> float:
-    """Return the smallest ⟨F(y) − F(z), y − z⟩/‖y − z‖² that a search finds: an upper bound on the
-    modulus of strong monotonicity of F."""
-    P, space, args = system.problem.operator(system.args), system.control, system.args
+class Monotonicity(NamedTuple):
+    """The smallest ⟨F(y) − F(z), y − z⟩/‖y − z‖² that a search finds, an upper bound on the modulus of
+    strong monotonicity of F; and a counterexample to strong pseudomonotonicity, if it is negative and
+    one was found from there."""
+
+    value: float
+    counterexample: CounterexamplePair | None
+
+
+def smallest_monotonicity(system: System, region: Region) -> Monotonicity:
+    """Return the result of a search over a bounded region."""
     low, high = _bounds(region)
+
+    def second(u: Tree, direction: Tree, length: Any) -> Tree:
+        return jtu.tree_map(
+            lambda p, e, a, b: jnp.clip(p + length.astype(e.dtype) * e, a, b),
+            u, direction, low[2], high[2],
+        )  # fmt: skip
 
     def negative_quotient(v: tuple) -> jax.Array:
         t, x, u, direction, length = v
-        K = system.problem.set_at(t, args)
-        F = system.problem.frozen(t, x, args)
-        w = jtu.tree_map(
-            lambda p, e, a, b: jnp.clip(p + length.astype(e.dtype) * e, a, b),
-            u,
-            direction,
-            low[2],
-            high[2],
-        )
-        y, z = K.project(P.apply(u), space), K.project(P.apply(w), space)
-        d = _tree.sub(y, z)
-        product, square = space.inner(_tree.sub(F(y), F(z)), d), space.inner(d, d)
+        products = _products(system, t, x, u, second(u, direction, length))
+        square = products.length**2
         # The rounding error of a product of near points.
         eps = jnp.finfo(square.dtype).eps
-        product = product + 64 * eps * (space.norm(F(y)) + space.norm(F(z))) * space.norm(d)
+        product = products.backward - products.forward + 64 * eps * products.norms * products.length
         return jnp.where(square > 1e-12, -product / jnp.maximum(square, 1e-12), -jnp.inf)
 
     width = jtu.tree_map(jnp.subtract, high[2], low[2])
@@ -216,7 +195,78 @@ def smallest_monotonicity(system: System, region: Region) -> float:
     ends = (*low, _tree.scale(-1.0, width), shortest), (*high, width, longest)
     points = _climb(negative_quotient, _points(*ends, _STARTS, 4, on_faces=True), *ends)
     values = jax.vmap(negative_quotient)(points)
-    return -float(jnp.max(jnp.where(jnp.isfinite(values), values, -jnp.inf)))
+    values = jnp.where(jnp.isfinite(values), values, -jnp.inf)
+    worst = jtu.tree_map(lambda leaf: leaf[jnp.argmax(values)], points)
+    value = -float(jnp.max(values))
+    if not value < 0:
+        return Monotonicity(value, None)
+    t, x, u, *apart = worst
+    found = _between_signs(system, (t, x), u, second(u, *apart), (low[:2], high[:2]))
+    return Monotonicity(value, _first_pair(system, found))
+
+
+def _between_signs(system: System, place: Any, u: Tree, w: Tree, ends: tuple[Any, Any]) -> Any:
+    """Return (t, x, u, w), one row, at the t and x of a box where ⟨F(y), z − y⟩ and ⟨F(z), z − y⟩ have
+    one size and other signs, if there is such a place on the segment along which the first changes
+    fastest."""
+
+    def middle(place: Any) -> jax.Array:
+        products = _products(system, *place, u, w)
+        return 0.5 * (products.forward + products.backward)
+
+    slope = jax.grad(middle)(place)
+    choose = lambda a, b: jtu.tree_map(lambda g, v, w: jnp.where(g > 0, v, w), slope, a, b)  # noqa: E731
+    below, above = choose(*ends), choose(*ends[::-1])
+
+    def halve(_: Any, segment: tuple[Any, Any]) -> tuple[Any, Any]:
+        below, above = segment
+        half = jtu.tree_map(lambda a, b: 0.5 * (a + b), below, above)
+        is_below = middle(half) < 0
+        return _tree.where(is_below, half, below), _tree.where(is_below, above, half)
+
+    t, x = jax.lax.fori_loop(0, _JUMP_HALVINGS, halve, (below, above))[0]
+    return jtu.tree_map(lambda leaf: leaf[None], (t, x, u, w))
+
+
+class _Products(NamedTuple):
+    """⟨F(y), z − y⟩, ⟨F(z), z − y⟩, ‖z − y‖ and ‖F(y)‖ + ‖F(z)‖."""
+
+    forward: jax.Array
+    backward: jax.Array
+    length: jax.Array
+    norms: jax.Array
+
+
+def _pair(system: System, t: Any, u: Tree, w: Tree) -> tuple[Tree, Tree]:
+    """Return the projections y of Pu and z of Pw onto K(t)."""
+    P, space = system.problem.operator(system.args), system.control
+    K = system.problem.set_at(t, system.args)
+    return K.project(P.apply(u), space), K.project(P.apply(w), space)
+
+
+def _products(system: System, t: Any, x: Tree, u: Tree, w: Tree) -> _Products:
+    space, F = system.control, system.problem.frozen(t, x, system.args)
+    y, z = _pair(system, t, u, w)
+    Fy, Fz, d = F(y), F(z), _tree.sub(z, y)
+    return _Products(
+        space.inner(Fy, d), space.inner(Fz, d), space.norm(d), space.norm(Fy) + space.norm(Fz)
+    )
+
+
+def _first_pair(system: System, candidates: Any) -> CounterexamplePair | None:
+    """Return the clearest counterexample among the candidates (t, x, u, w), or None."""
+    forward, backward, length, norms = jax.vmap(lambda v: _products(system, *v))(candidates)
+    eps = float(jnp.finfo(length.dtype).eps)
+    gain = jnp.minimum(forward, -backward) - _ROUNDING_FACTOR * eps * norms * length
+    gain = jnp.where((length > _NEAREST) & jnp.isfinite(gain), gain, -jnp.inf)
+    k = int(jnp.argmax(gain))
+    if not float(gain[k]) > 0:
+        return None
+    t, x, u, w = jtu.tree_map(lambda leaf: leaf[k], candidates)
+    return CounterexamplePair(
+        float(t), x, *_pair(system, t, u, w), float(backward[k] / length[k] ** 2),
+        float(forward[k]), float(backward[k]),
+    )  # fmt: skip
 
 
 def _climb(value: Callable[[Any], jax.Array], starts: Any, low: Any, high: Any) -> Any:

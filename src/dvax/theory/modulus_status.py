@@ -68,11 +68,11 @@ def modulus_statuses(
         if np.isfinite(value):
             by_name[name] = ModulusStatus(value, "proved", method)
         elif box is None:
-            why = _reason_without_proof(proved, of, method)
+            why = _reason_without_proof(proved, of, method, value)
             by_name[name] = ModulusStatus(value, "estimated", why)
         else:
             found = search_slope(system, box, of, by)
-            why = _reason_without_proof(proved, of, method)
+            why = _reason_without_proof(proved, of, method, value)
             by_name[name] = _estimate(found.value, declared.get(name), box, why)
             if found.jump is not None:
                 place = f"{by} = {_tree.short(found.jump.place)}"
@@ -86,7 +86,7 @@ def modulus_statuses(
     gamma, reason = proved.gamma
     if unweighted is not None and unweighted.gamma > gamma:
         gamma, reason = unweighted.gamma, unweighted.reason
-    reason = reason if gamma > 0 else _reason_without_proof(proved, "h", reason)
+    reason = reason if gamma > 0 else _reason_without_proof(proved, "h", reason, gamma)
     by_name["gamma"], pair = _gamma_status(system, gamma, reason, box, declared)
     if by_name["gamma"].value > by_name["L_F"].value:
         # γ of a pseudomonotone law may exceed L_F. `Constants` needs γ ≤ L_F, and a larger L_F
@@ -101,10 +101,12 @@ def modulus_statuses(
     return ModulusStatuses(by_name, unweighted, pair, exact)
 
 
-def _reason_without_proof(proved: Moduli, of: str, method: str) -> str:
-    """Return why there is no proof: operations without a rule, or the method that found no bound."""
+def _reason_without_proof(proved: Moduli, of: str, method: str, value: float) -> str:
+    """Return why there is no proof: operations without a rule, or what the method proves."""
     names = proved.unknown[of]
-    return f"{of} uses {', '.join(names)}, without a rule" if names else method
+    if names:
+        return f"{of} uses {', '.join(names)}, without a rule"
+    return f"{method}: " + (f"it is at least {value:.6g}" if np.isfinite(value) else "no bound")
 
 
 def _estimate(lower: float, declared: float | None, box: Region, why: str) -> ModulusStatus:
@@ -140,7 +142,9 @@ def _gamma_status(
     if box is None:
         return ModulusStatus(gamma, "estimated", reason), None
     search = f"a search over {describe(box)}"
-    pair = find_counterexample(system, box)
+    pair, upper = find_counterexample(system, box), np.inf
+    if pair is None and "gamma" not in declared:
+        upper, pair = smallest_monotonicity(system, box)
     if pair is not None:
         why = (
             f"at t = {pair.t:.6g}, x = {_tree.short(pair.x)}: y = {_tree.short(pair.y)} and "
@@ -151,8 +155,7 @@ def _gamma_status(
     if "gamma" in declared:
         reason = f"declared; {search} did not refute it"
         return ModulusStatus(declared["gamma"], "declared", reason), None
-    upper = smallest_monotonicity(system, box)
-    reason = f"an upper bound from {search}; no proof from the code ({reason})"
+    reason = f"strong monotonicity has no larger one by {search}; no proof from the code ({reason})"
     return ModulusStatus(upper, "estimated", reason), None
 
 

@@ -169,7 +169,7 @@ class Tube:
                 return found
         raise input_error(
             "dvax.bound_error(constants)", "None",
-            f"without constants, they are proved along the trajectory: {found}",
+            f"{found}; without constants, all that a bound needs are proved along the trajectory",
             "Pass dvax.verify(problem, x0, x=(low, high), declared={…}).constants",
         )  # fmt: skip
 

@@ -159,7 +159,9 @@ def verify(
     responses = intersect(given_u, possible)
     time = interval(t0, t1)
     region = Region(time, states, responses)
-    box = Region(time, search_box(states, x0), search_box(responses, system.u0))
+    box = None
+    if K.empty_at is None:  # else a search would project onto an empty set
+        box = Region(time, search_box(states, x0), search_box(responses, system.u0))
     moduli = modulus_statuses(system, region, box, _declared(declared))
     statuses = tuple(assumptions(system, region, K, knots, moduli))
     # P⁻¹K(t) contains every response, so the domain needs only the bounds that exclude a part of it:

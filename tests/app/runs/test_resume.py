@@ -126,6 +126,15 @@ def test_a_resumed_run_equals_one_that_was_not_interrupted(folder, part):
         assert manifest.get(key) == whole.get(key)
 
 
+@pytest.mark.slow
+def test_a_run_that_another_process_finished_meanwhile_is_not_done_again(folder, tmp_path):
+    whole = Path(shutil.copytree(folder / "whole", tmp_path / "whole"))
+    before = results(whole)
+    with pytest.raises(dvax.InputError, match="a finished run"):
+        go_on(whole)
+    assert results(whole) == before
+
+
 @pytest.mark.thorough
 def test_a_run_that_failed_within_a_piece_resumes_at_its_beginning(tmp_path):
     """f is NaN for 1.03 < t < 1.09, and 21 frames make pieces of 0.2."""

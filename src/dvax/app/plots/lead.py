@@ -96,12 +96,10 @@ def _bounded(run: RunRecord) -> str:
     status = str(entry["bound"])
     if status not in _RESTS_ON:
         return f"The error bound is {status}: this method keeps no data to compute it from."
-    meaning = str(entry.get("meaning", "")).removesuffix(f" ({status})")
     if not is_finite(entry):
         why = f": {entry['why']}" if "why" in entry else ""
-        return (
-            f"The error bound is not finite, so it states nothing about the error ({meaning}){why}."
-        )
+        return f"The error bound is not finite, so it states nothing about the error{why}."
+    meaning = str(entry.get("meaning", "")).removesuffix(f" ({status})")
     amount = f"{entry_text(entry)} {unit_text(str(entry.get('unit', '')))}".strip()
     text = f"The error bound is {status}: {amount}"
     relative = entry.get("relative")

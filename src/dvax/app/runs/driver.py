@@ -7,8 +7,10 @@ from dvax.app.runs.applications.run import ApplicationRun
 from dvax.app.runs.config import Config
 from dvax.app.runs.contact_run import ContactRun
 from dvax.app.runs.interrupt import interruptible, terminable
+from dvax.app.runs.json_files import read_object
 from dvax.app.runs.run import AbstractRun, Listener, RunOutcome
 from dvax.app.runs.rundir import RunDirectory, target_problems
+from dvax.errors import input_error
 
 
 def run(
@@ -46,13 +48,19 @@ def resume(
     """Go on with a run that ended early, from its checkpoints; `config` is its resolved one. The
     results are those of a run that was not interrupted.
 
-    **Raises:** `dvax.InputError` if another process writes the run, or if configuration, data or
-    versions have changed.
+    **Raises:** `dvax.InputError` if another process writes the run or has finished it, or if
+    configuration, data or versions have changed.
     """
     with terminable():
-        task = interruptible(lambda: _prepared(config, on_event or (lambda event: None)))
+        # First of all the lock, since a run that another process finished is not to be done again.
         opened = RunDirectory(directory, clear=False)
         try:
+            if read_object(directory / "manifest.json").get("status") == "finished":
+                raise input_error(
+                    str(directory), "a finished run", "there is nothing to go on with",
+                    "See its report.html",
+                )  # fmt: skip
+            task = interruptible(lambda: _prepared(config, on_event or (lambda event: None)))
             return task.go(opened, resume=True)
         finally:
             opened.close()

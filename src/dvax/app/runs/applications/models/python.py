@@ -33,6 +33,11 @@ _REMEDY_ALONG = (
     "smaller: docs/models/own-problem.md says how."
 )
 
+_REMEDY_NOT_PROVED = (
+    "If you know it, pass constants=dvax.verify(…, declared={…}).constants to dvax.models.Model: "
+    "docs/howto/troubleshooting.md shows how."
+)
+
 _REMEDY_NOT_FOLLOWED = (
     "bound_steps = 0 in [model] asks for a bound by constants. Leave it out for one that is proved "
     "along the trajectory."
@@ -181,7 +186,7 @@ class PythonApplication(AbstractModelApplication):
                     self.own.problem, piece, self.times, self.t_end, max_steps=steps
                 )
             except InputError as error:
-                self.follower = error.problems[0].rule
+                self.follower, self.remedy = error.problems[0].rule, _REMEDY_NOT_PROVED
         if isinstance(self.follower, BoundAlong):
             return along(self.follower, piece, before)
         return Certificate(np.full(len(piece.ts), np.inf), "estimated", why=self.follower)
