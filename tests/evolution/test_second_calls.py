@@ -159,3 +159,19 @@ def test_concrete_responses_are_read_inside_of_a_transformation():
 
     inside = jax.jit(read)(2.0)
     np.testing.assert_allclose(inside, read(2.0), rtol=1e-15)
+
+
+def test_second_verification_of_a_law_without_a_proof_compiles_nothing():
+    """The search for counterexamples is one program for all parameters."""
+
+    def verify(load):
+        law = dvax.Problem(
+            A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0),
+            K=dvax.sets.Box(0.0, jnp.ones(2)), f=lambda t, x, u, load: load - u,
+            h=lambda t, x, u, load: x * load - jnp.sin(9.0 * u),
+        )  # fmt: skip
+        return dvax.verify(law, jnp.ones(2), 0.0, 2.0, jnp.asarray(load))["ass:strong_pseudomono"]
+
+    assert verify(3.0).status != "proved"
+    with nothing_is("compile"):
+        verify(2.5)

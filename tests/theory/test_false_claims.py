@@ -343,3 +343,45 @@ def test_a_sum_of_exponentials_beside_a_value_of_many_operations_is_bounded():
     system = problem(f=lambda t, x, u, a: deep(x) - jnp.log(1 + jnp.exp(x)))
     found = dvax.verify(system, jnp.zeros(2), 0.0, 1.0, x=(-1.0, 1.0))
     assert 0.731 <= float(found.constants.alpha_f) <= 0.74
+
+
+def _of_three(F, **other):
+    law = dict(K=dvax.sets.Box(0.0, jnp.ones(3)), h=lambda t, x, u, a: u - F(u, a) - x)
+    return problem(**{**law, **other})
+
+
+INDEFINITE = {
+    "affine": lambda u, a: 0.02 * jnp.sum(u) - 1e-3 * u,
+    "cubic": lambda u, a: 4.0 * (u - 0.5) ** 3 - 0.1 * u,
+    "one direction": lambda u, a: u - 0.7 * jnp.sum(u),
+}
+
+
+@pytest.mark.parametrize("name", INDEFINITE)
+def test_verify_refutes_a_law_whose_slope_is_negative_somewhere(name):
+    """x moves F so that ⟨F(y), z − y⟩ ≥ 0 > ⟨F(z), z − y⟩ for two points along which F decreases."""
+    F = INDEFINITE[name]
+    found = dvax.verify(_of_three(F), jnp.ones(3), 0.0, 1.0)["ass:strong_pseudomono"]
+    assert found.status == "refuted"
+    x, y, z = (np.asarray(getattr(found.evidence, name)) for name in ("x", "y", "z"))
+    assert (y >= 0).all() and (z >= 0).all() and (y <= 1).all() and (z <= 1).all()
+    assert np.asarray(F(y, None) + x) @ (z - y) >= 0.0 > np.asarray(F(z, None) + x) @ (z - y)
+
+
+def test_speed_of_h_in_time_is_a_norm():
+    moving = problem(h=lambda t, x, u, a: jnp.array([3.0, 4.0]) * t - u, control_space=None)
+    why = dvax.verify(moving, jnp.zeros(2), 0.0, 1.0)["ass:time_regularity (ii)"].why
+    assert "‖∂h/∂t‖ ≤ 5" in why
+
+
+def test_verify_of_a_set_that_is_empty_somewhere_searches_nothing():
+    rows = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
+    empty = _of_three(
+        lambda u, a: 2.0 * u + 0.1 * jnp.roll(u, 1) * jnp.sum(u),
+        K=lambda t, a: dvax.sets.ConstrainedBox(
+            jnp.zeros(3), jnp.ones(3), rows, jnp.array([0.0, 1.0]) + 3.0 * t, jnp.full(2, 9.0)
+        ),
+    )
+    found = dvax.verify(empty, jnp.ones(3), 0.0, 1.0)
+    assert found["ass:operators (iii)"].status == "refuted"
+    assert "search" not in found["ass:strong_pseudomono"].why

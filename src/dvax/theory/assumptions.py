@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -9,6 +10,7 @@ import numpy as np
 
 from .. import _tree
 from .._tree import Tree
+from ..problem import Problem
 from ..programs.slope import Slope, SlopeEnclosure, TooLarge, interval, is_slope
 from .certificate import is_declared
 from .modulus_status import ModulusStatuses
@@ -114,6 +116,13 @@ def _sets(K: SetMotion) -> Assumption:
     return Assumption(label, statement, "estimated", "tested at a sample of times only")
 
 
+@eqx.filter_jit
+def _is_finite(problem: Problem, x: Tree, u: Tree, args: Any, times: jax.Array) -> jax.Array:
+    """Return at which times f is finite. One program for all parameters: JAX would compile one for each
+    operation of f."""
+    return jax.vmap(lambda t: _tree.all_finite(problem.f(t, x, u, args)))(times)
+
+
 def _integrable(
     system: System,
     finite_region: Region,
@@ -128,9 +137,8 @@ def _integrable(
         return system.problem.f(t, zero, system.u0, system.args)
 
     samples = np.linspace(*span, _SAMPLES)
-    # One program: JAX would compile one for each operation of f.
-    is_finite = jax.jit(jax.vmap(lambda t: _tree.all_finite(f_at_zero(t))))
-    finite = np.asarray(is_finite(jnp.asarray(samples)))
+    args = _tree.as_arrays(system.args)
+    finite = np.asarray(_is_finite(system.problem, zero, system.u0, args, jnp.asarray(samples)))
     if not finite.all():
         t = samples[np.argmin(finite)]
         why = f"f(t, 0, 0) = {_tree.short(f_at_zero(jnp.asarray(t)))} at t = {t:.17g}"

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -94,7 +95,7 @@ def search_slope(system: System, region: Region, name: str, by: str) -> SlopeSea
     starts = _points(low, high, _STARTS, 1)
     t, *at = jtu.tree_map(lambda leaf: leaf[0], starts)
     known = has_derivative(partial(with_argument, t, *at), at[0 if by == "x" else 1])
-    best = [jax.vmap(norm)(_climb(norm, starts, low, high))] if known else []
+    best = [jax.jit(lambda starts: _climb(norm, starts, low, high)[1])(starts)] if known else []
     others = _points(low, high, _STARTS, 2)
     quotients = []
     k = 1 if by == "x" else 2
@@ -150,16 +151,9 @@ def find_counterexample(system: System, region: Region) -> CounterexamplePair | 
     none was found.
     """
     low, high = _bounds(region)
-
-    def violation(v: tuple) -> jax.Array:
-        products = _products(system, *v)
-        gain = jnp.minimum(products.forward, -products.backward)
-        near = products.length > _NEAREST
-        return jnp.where(near, gain / jnp.maximum(products.length, _NEAREST) ** 2, -jnp.inf)
-
     ends = (*low, low[2]), (*high, high[2])
-    candidates = _climb(violation, _points(*ends, 4 * _STARTS, 3, on_faces=True), *ends)
-    return _first_pair(system, candidates)
+    starts = _points(*ends, 4 * _STARTS, 3, on_faces=True)
+    return _pair(*_most_violated(_Law.of(system), starts, *ends))
 
 
 class Monotonicity(NamedTuple):
@@ -173,7 +167,76 @@ class Monotonicity(NamedTuple):
 
 def smallest_monotonicity(system: System, region: Region) -> Monotonicity:
     """Return the result of a search over a bounded region."""
-    low, high = _bounds(region)
+    law, (low, high) = _Law.of(system), _bounds(region)
+    width = jtu.tree_map(jnp.subtract, high[2], low[2])
+    shortest, longest = jnp.asarray(1e-3), jnp.asarray(1.0)
+    ends = (*low, _tree.scale(-1.0, width), shortest), (*high, width, longest)
+    value, worst = _least_monotone(law, _points(*ends, _STARTS, 4, on_faces=True), *ends)
+    if not float(value) < 0:
+        return Monotonicity(float(value), None)
+    return Monotonicity(float(value), _pair(*_between_signs(law, worst, low[:2], high[:2])))
+
+
+class _Products(NamedTuple):
+    """y and z in K(t), ⟨F(y), z − y⟩, ⟨F(z), z − y⟩, ‖z − y‖ and ‖F(y)‖ + ‖F(z)‖."""
+
+    y: Tree
+    z: Tree
+    forward: jax.Array
+    backward: jax.Array
+    length: jax.Array
+    norms: jax.Array
+
+    @property
+    def gain(self) -> jax.Array:
+        """By how much the signs of both products contradict strong pseudomonotonicity."""
+        return jnp.minimum(self.forward, -self.backward)
+
+
+class _Law(eqx.Module):
+    """The law of a problem with its parameters: one compiled search serves all their values."""
+
+    problem: Any
+    args: Any
+    control: AbstractSpace
+
+    @classmethod
+    def of(cls, system: System) -> "_Law":
+        return cls(system.problem, _tree.as_arrays(system.args), system.control)
+
+    def products(self, t: Any, x: Tree, u: Tree, w: Tree) -> _Products:
+        """Return the products for the projections y of Pu and z of Pw onto K(t)."""
+        problem, args, space = self.problem, self.args, self.control
+        P, K, F = problem.operator(args), problem.set_at(t, args), problem.frozen(t, x, args)
+        y, z = K.project(P.apply(u), space), K.project(P.apply(w), space)
+        Fy, Fz, d = F(y), F(z), _tree.sub(z, y)
+        forward, backward = space.inner(Fy, d), space.inner(Fz, d)
+        return _Products(y, z, forward, backward, space.norm(d), space.norm(Fy) + space.norm(Fz))
+
+
+@eqx.filter_jit
+def _most_violated(law: _Law, starts: Any, low: Any, high: Any) -> tuple[Any, Tree, _Products, Any]:
+    """Return t, x, the products and their gain less its rounding error for the clearest counterexample
+    that an ascent from many starts finds; it is one if the gain is positive."""
+
+    def violation(v: tuple) -> jax.Array:
+        products = law.products(*v)
+        near = products.length > _NEAREST
+        gain = products.gain / jnp.maximum(products.length, _NEAREST) ** 2
+        return jnp.where(near, gain, -jnp.inf)
+
+    candidates = _climb(violation, starts, low, high)[0]
+    products = jax.vmap(lambda v: law.products(*v))(candidates)
+    gain = _certain(products)
+    first = lambda tree: jtu.tree_map(lambda leaf: leaf[jnp.argmax(gain)], tree)  # noqa: E731
+    t, x, *_ = first(candidates)
+    return t, x, first(products), jnp.max(gain)
+
+
+@eqx.filter_jit
+def _least_monotone(law: _Law, starts: Any, low: Any, high: Any) -> tuple[Any, Any]:
+    """Return the smallest quotient that an ascent from many starts finds, and (t, x, u, w) there. The
+    variables are t, x, u and the direction and length of w − u."""
 
     def second(u: Tree, direction: Tree, length: Any) -> Tree:
         return jtu.tree_map(
@@ -183,40 +246,33 @@ def smallest_monotonicity(system: System, region: Region) -> Monotonicity:
 
     def negative_quotient(v: tuple) -> jax.Array:
         t, x, u, direction, length = v
-        products = _products(system, t, x, u, second(u, direction, length))
+        products = law.products(t, x, u, second(u, direction, length))
         square = products.length**2
         # The rounding error of a product of near points.
-        eps = jnp.finfo(square.dtype).eps
-        product = products.backward - products.forward + 64 * eps * products.norms * products.length
+        rounding = 64 * jnp.finfo(square.dtype).eps * products.norms * products.length
+        product = products.backward - products.forward + rounding
         return jnp.where(square > 1e-12, -product / jnp.maximum(square, 1e-12), -jnp.inf)
 
-    width = jtu.tree_map(jnp.subtract, high[2], low[2])
-    shortest, longest = jnp.asarray(1e-3), jnp.asarray(1.0)
-    ends = (*low, _tree.scale(-1.0, width), shortest), (*high, width, longest)
-    points = _climb(negative_quotient, _points(*ends, _STARTS, 4, on_faces=True), *ends)
-    values = jax.vmap(negative_quotient)(points)
+    points, values = _climb(negative_quotient, starts, low, high)
     values = jnp.where(jnp.isfinite(values), values, -jnp.inf)
-    worst = jtu.tree_map(lambda leaf: leaf[jnp.argmax(values)], points)
-    value = -float(jnp.max(values))
-    if not value < 0:
-        return Monotonicity(value, None)
-    t, x, u, *apart = worst
-    found = _between_signs(system, (t, x), u, second(u, *apart), (low[:2], high[:2]))
-    return Monotonicity(value, _first_pair(system, found))
+    t, x, u, direction, length = jtu.tree_map(lambda leaf: leaf[jnp.argmax(values)], points)
+    return -jnp.max(values), (t, x, u, second(u, direction, length))
 
 
-def _between_signs(system: System, place: Any, u: Tree, w: Tree, ends: tuple[Any, Any]) -> Any:
-    """Return (t, x, u, w), one row, at the t and x of a box where ⟨F(y), z − y⟩ and ⟨F(z), z − y⟩ have
-    one size and other signs, if there is such a place on the segment along which the first changes
+@eqx.filter_jit
+def _between_signs(law: _Law, point: Any, low: Any, high: Any) -> tuple[Any, Tree, _Products, Any]:
+    """Return what `_most_violated` does for the u and w of a point, at the t and x of a box where both
+    products have one size and other signs, if there are any on the segment along which they change
     fastest."""
+    t, x, u, w = point
 
     def middle(place: Any) -> jax.Array:
-        products = _products(system, *place, u, w)
+        t, x = place
+        products = law.products(t, x, u, w)
         return 0.5 * (products.forward + products.backward)
 
-    slope = jax.grad(middle)(place)
-    choose = lambda a, b: jtu.tree_map(lambda g, v, w: jnp.where(g > 0, v, w), slope, a, b)  # noqa: E731
-    below, above = choose(*ends), choose(*ends[::-1])
+    slope = jax.grad(middle)((t, x))
+    is_rising = jtu.tree_map(lambda g: g > 0, slope)
 
     def halve(_: Any, segment: tuple[Any, Any]) -> tuple[Any, Any]:
         below, above = segment
@@ -224,71 +280,56 @@ def _between_signs(system: System, place: Any, u: Tree, w: Tree, ends: tuple[Any
         is_below = middle(half) < 0
         return _tree.where(is_below, half, below), _tree.where(is_below, above, half)
 
-    t, x = jax.lax.fori_loop(0, _JUMP_HALVINGS, halve, (below, above))[0]
-    return jtu.tree_map(lambda leaf: leaf[None], (t, x, u, w))
-
-
-class _Products(NamedTuple):
-    """⟨F(y), z − y⟩, ⟨F(z), z − y⟩, ‖z − y‖ and ‖F(y)‖ + ‖F(z)‖."""
-
-    forward: jax.Array
-    backward: jax.Array
-    length: jax.Array
-    norms: jax.Array
-
-
-def _pair(system: System, t: Any, u: Tree, w: Tree) -> tuple[Tree, Tree]:
-    """Return the projections y of Pu and z of Pw onto K(t)."""
-    P, space = system.problem.operator(system.args), system.control
-    K = system.problem.set_at(t, system.args)
-    return K.project(P.apply(u), space), K.project(P.apply(w), space)
-
-
-def _products(system: System, t: Any, x: Tree, u: Tree, w: Tree) -> _Products:
-    space, F = system.control, system.problem.frozen(t, x, system.args)
-    y, z = _pair(system, t, u, w)
-    Fy, Fz, d = F(y), F(z), _tree.sub(z, y)
-    return _Products(
-        space.inner(Fy, d), space.inner(Fz, d), space.norm(d), space.norm(Fy) + space.norm(Fz)
+    segment = (
+        jtu.tree_map(jnp.where, is_rising, low, high),
+        jtu.tree_map(jnp.where, is_rising, high, low),
     )
+    t, x = jax.lax.fori_loop(0, _JUMP_HALVINGS, halve, segment)[0]
+    products = law.products(t, x, u, w)
+    return t, x, products, _certain(products)
 
 
-def _first_pair(system: System, candidates: Any) -> CounterexamplePair | None:
-    """Return the clearest counterexample among the candidates (t, x, u, w), or None."""
-    forward, backward, length, norms = jax.vmap(lambda v: _products(system, *v))(candidates)
-    eps = float(jnp.finfo(length.dtype).eps)
-    gain = jnp.minimum(forward, -backward) - _ROUNDING_FACTOR * eps * norms * length
-    gain = jnp.where((length > _NEAREST) & jnp.isfinite(gain), gain, -jnp.inf)
-    k = int(jnp.argmax(gain))
-    if not float(gain[k]) > 0:
+def _certain(products: _Products) -> jax.Array:
+    """Return the gain less its rounding error; −∞ for points that are too near."""
+    eps = jnp.finfo(products.length.dtype).eps
+    gain = products.gain - _ROUNDING_FACTOR * eps * products.norms * products.length
+    return jnp.where((products.length > _NEAREST) & jnp.isfinite(gain), gain, -jnp.inf)
+
+
+def _pair(t: Any, x: Tree, products: _Products, gain: Any) -> CounterexamplePair | None:
+    if not float(gain) > 0:
         return None
-    t, x, u, w = jtu.tree_map(lambda leaf: leaf[k], candidates)
     return CounterexamplePair(
-        float(t), x, *_pair(system, t, u, w), float(backward[k] / length[k] ** 2),
-        float(forward[k]), float(backward[k]),
+        float(t), x, products.y, products.z, float(products.backward / products.length**2),
+        float(products.forward), float(products.backward),
     )  # fmt: skip
 
 
-def _climb(value: Callable[[Any], jax.Array], starts: Any, low: Any, high: Any) -> Any:
+def _climb(
+    value: Callable[[Any], jax.Array], starts: Any, low: Any, high: Any
+) -> tuple[Any, jax.Array]:
     """Return the points after sign-gradient ascent with decreasing steps, accepted if they increase
-    `value`."""
+    `value`, and the values there."""
     width = jtu.tree_map(jnp.subtract, high, low)
 
     def step(k: Any, carry: tuple) -> tuple:
-        point, best = carry
-        fraction = 0.3 * 0.9**k
-        new = jtu.tree_map(
-            lambda p, g, w, a, b: jnp.clip(p + fraction * w * jnp.sign(jnp.nan_to_num(g)), a, b),
-            point, jax.grad(value)(point), width, low, high,
-        )  # fmt: skip
-        new_value = value(new)
+        point, best, slope, trial = carry
+        new_value, new_slope = jax.value_and_grad(value)(trial)
         better = new_value > best
-        return _tree.where(better, new, point), jnp.where(better, new_value, best)
+        point, slope = _tree.where(better, trial, point), _tree.where(better, new_slope, slope)
+        fraction = 0.3 * 0.9**k
+        trial = jtu.tree_map(
+            lambda p, g, w, a, b: jnp.clip(p + fraction * w * jnp.sign(jnp.nan_to_num(g)), a, b),
+            point, slope, width, low, high,
+        )  # fmt: skip
+        return point, jnp.where(better, new_value, best), slope, trial
 
-    def climb(point: Any) -> Any:
-        return jax.lax.fori_loop(0, _ASCENT_STEPS, step, (point, value(point)))[0]
+    def climb(point: Any) -> tuple[Any, jax.Array]:
+        least = jnp.full_like(jax.eval_shape(value, point), -jnp.inf)
+        start = point, least, _tree.zeros_like(point), point
+        return jax.lax.fori_loop(0, _ASCENT_STEPS + 1, step, start)[:2]
 
-    return jax.jit(jax.vmap(climb))(starts)
+    return jax.vmap(climb)(starts)
 
 
 def _quotient(

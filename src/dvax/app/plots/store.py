@@ -97,7 +97,7 @@ def open_store(path: Path) -> tuple[Store, int]:
         increasing = np.isfinite(time) & (np.diff(time, prepend=-np.inf) > 0)
         room = len(time)
         count = room if increasing.all() else int(np.argmin(increasing))
-    order = group.attrs.asdict().get("variable_order", [])
+    order: Any = group.attrs.asdict().get("variable_order", [])
     names = [name for name in order if name in arrays]
     names += [name for name in arrays if name not in names]
     variables = {name: Variable(arrays[name], count, axis) for name in names}
