@@ -53,6 +53,9 @@ _TOUCH = 2.0
 _ROUNDINGS = 1024.0
 """Roundings of the largest value of a function, below which its value is not told from zero."""
 
+_ROUNDINGS_OF_U = 8.0
+"""Roundoff of u, in roundings of its largest entry."""
+
 _LAW_WINDOW, _LAW_ERRORS = 4.0, 300.0
 """Errors of the law, in its tolerances, by which an event may lie before the end of a step that ends
 behind it, and within which its time is found again."""
@@ -158,14 +161,19 @@ class EventWatch(eqx.Module):
         )
 
     def _law_error(self, flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
-        """Return by how much values differ with responses that all count as solved, as estimated from
-        their change along one direction; 0 where the law is not iterated."""
-        if not flow.iterates:
-            return jnp.zeros(len(self.events), jnp.result_type(*jtu.tree_leaves(x)))
-        y = flow.problem.zero_control(x) if guess is None else guess
+        """Return by how much values differ with responses that all count as solved, up to roundoff, as
+        estimated from their change along two directions."""
+        y = flow.rate(t, x, None).y if guess is None else guess
+        size = jnp.max(jnp.stack([jnp.max(jnp.abs(v), initial=0.0) for v in jtu.tree_leaves(y)]))
+        error = _ROUNDINGS_OF_U * jnp.finfo(size.dtype).eps * size
+        if flow.iterates:
+            error += flow.law_tol(t, x, y)
         values = lambda y: self._at(t, x, flow.operator.inverse(y), flow.args)  # noqa: E731
-        change = jax.jvp(values, (y,), (one_direction(y),))[1]
-        return flow.law_tol(t, x, y) * jnp.abs(change)
+        direction = one_direction(y)
+        # With signs that alternate, since the changes of two entries may cancel.
+        other = jtu.tree_map(_alternating, direction)
+        changes = (jax.jvp(values, (y,), (d,))[1] for d in (direction, other))
+        return error * jnp.maximum(*map(jnp.abs, changes))
 
     def along_flow(
         self, flow: Flow, t: Any, x: Tree, guess: Tree | None, s: Any = 0.0
@@ -524,6 +532,11 @@ def _constant(leaf: Any) -> Any:
 
 def _response(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Tree:
     return flow.operator.inverse(flow.rate(t, x, guess).y)
+
+
+def _alternating(leaf: jax.Array) -> jax.Array:
+    signs = 1.0 - 2.0 * (jnp.arange(leaf.size, dtype=leaf.dtype) % 2.0)
+    return leaf * signs.reshape(leaf.shape)
 
 
 def _beyond(error: Any, values: jax.Array) -> jax.Array:
