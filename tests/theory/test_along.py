@@ -393,7 +393,7 @@ def test_what_cannot_be_proved_is_refused():
         lambda t, x, u, args: -x, dvax.sets.Box(-1.0, 1.0), control=dvax.spaces.Euclidean(4),
     )  # fmt: skip
     sol = dvax.solve(opaque, jnp.full(4, 0.1), 0.0, 0.1)
-    with pytest.raises(dvax.InputError, match="proved along the trajectory: .* is not proved"):
+    with pytest.raises(dvax.InputError, match="is not proved.*proved along the trajectory"):
         dvax.bound_error(opaque, sol)
     system, x0 = van_der_pol(1.0)
     with pytest.raises(dvax.InputError, match="values, which are traced"):
