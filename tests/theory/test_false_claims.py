@@ -368,6 +368,12 @@ def test_verify_refutes_a_law_whose_slope_is_negative_somewhere(name):
     assert np.asarray(F(y, None) + x) @ (z - y) >= 0.0 > np.asarray(F(z, None) + x) @ (z - y)
 
 
+def test_a_declared_modulus_of_a_law_that_decreases_is_refuted():
+    given = _of_three(INDEFINITE["affine"])
+    found = dvax.verify(given, jnp.ones(3), 0.0, 1.0, declared={"gamma": 0.1})
+    assert found["ass:strong_pseudomono"].status == "refuted"
+
+
 def test_speed_of_h_in_time_is_a_norm():
     moving = problem(h=lambda t, x, u, a: jnp.array([3.0, 4.0]) * t - u, control_space=None)
     why = dvax.verify(moving, jnp.zeros(2), 0.0, 1.0)["ass:time_regularity (ii)"].why

@@ -155,6 +155,7 @@ class EventWatch(eqx.Module):
         return self._at(t, x, _response(flow, t - inset, x, guess), flow.args)
 
     def _at(self, t: Any, x: Tree, u: Tree, args: Any) -> jax.Array:
+        """Return the values of all functions for the response u."""
         dtype = jnp.result_type(*jtu.tree_leaves(x))
         return jnp.stack(
             [jnp.asarray(e.function(t, x, u, args), dtype).reshape(()) for e in self.events]
@@ -467,8 +468,8 @@ class EventWatch(eqx.Module):
 
         reach = jnp.where(jnp.isfinite(width), width, 0.0)
 
-        def newton(left: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
-            s = carry[0] - left
+        def newton(number: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            s = carry[0] - lefts[number]
             values, slopes = self.along_flow(flow, t, x, guess, s)
             slope = slopes[k]
             return s - values[k] / jnp.where(slope == 0, 1.0, slope), slope != 0
@@ -476,7 +477,7 @@ class EventWatch(eqx.Module):
         # The derivatives of two steps from the zero are those of the zero, up to the second.
         start = jnp.zeros_like(t), jnp.asarray(True)
         lefts = reach * jnp.asarray([1.0, _LEFT, _LEFT], t.dtype)
-        s, exists = lax.fori_loop(0, 3, lambda i, carry: newton(lefts[i], carry), start)
+        s, exists = lax.fori_loop(0, 3, newton, start)
         exists &= jnp.abs(s) <= 2.0 * width
         s = jnp.where(fired & exists, s, 0.0)
         (s,) = nan_derivatives_if_used(fired & ~exists, [s], (flow, t, x))

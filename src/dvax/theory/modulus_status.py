@@ -106,7 +106,9 @@ def _reason_without_proof(proved: Moduli, of: str, method: str, value: float) ->
     names = proved.unknown[of]
     if names:
         return f"{of} uses {', '.join(names)}, without a rule"
-    return f"{method}: " + (f"it is at least {value:.6g}" if np.isfinite(value) else "no bound")
+    return f"{method} " + (
+        f"proves only γ ≥ {value:.6g}" if np.isfinite(value) else "gives no bound"
+    )
 
 
 def _estimate(lower: float, declared: float | None, box: Region, why: str) -> ModulusStatus:
@@ -143,7 +145,7 @@ def _gamma_status(
         return ModulusStatus(gamma, "estimated", reason), None
     search = f"a search over {describe(box)}"
     pair, upper = find_counterexample(system, box), np.inf
-    if pair is None and "gamma" not in declared:
+    if pair is None:
         upper, pair = smallest_monotonicity(system, box)
     if pair is not None:
         why = (
@@ -155,7 +157,10 @@ def _gamma_status(
     if "gamma" in declared:
         reason = f"declared; {search} did not refute it"
         return ModulusStatus(declared["gamma"], "declared", reason), None
-    reason = f"strong monotonicity has no larger one by {search}; no proof from the code ({reason})"
+    reason = (
+        f"an upper bound of the modulus of strong monotonicity from {search}; no proof from the code "
+        f"({reason})"
+    )
     return ModulusStatus(upper, "estimated", reason), None
 
 
