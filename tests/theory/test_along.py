@@ -284,12 +284,32 @@ def test_a_solution_in_parts_has_the_bound_of_the_whole(family):
     # Pieces are as long as they are for the whole solution.
     np.testing.assert_allclose(joined, whole, rtol=1e-12)
     # With less work than that, the tolerance is larger, and the bound too.
-    half = BoundAlong(system, sol, np.asarray(sol.ts), 4.0, max_steps=follower.steps // 2)
-    assert half.bound(sol).x[-1] < np.inf and half.steps <= follower.steps // 2
+    work = follower.steps // 2
+    half = BoundAlong(system, sol, np.asarray(sol.ts), 4.0, max_steps=work)
+    half_bound = half.bound(sol)
+    assert half_bound.x[-1] < np.inf and half.steps <= work
+    bound = dvax.bound_error(system, sol, max_steps=work)
+    np.testing.assert_allclose(bound.x, half_bound.x, rtol=1e-12)
     # No step is left for the parts behind a limit.
     short = BoundAlong(system, parts[0], np.asarray(sol.ts), 4.0, max_steps=100)
-    assert np.isinf(short.bound(parts[0]).x[-1]) and "steps to t = " in short.why
+    assert np.isinf(short.bound(parts[0]).x[-1]) and "steps and did not reach" in short.why
     assert np.isinf(short.bound(parts[1]).x).all()
+
+
+@pytest.mark.slow
+def test_the_work_of_a_bound_has_a_limit():
+    """A fast mode that only the law damps: it has the time scale 1e-7 of the run."""
+    stiff = dvax.Problem(
+        A=dvax.generators.Scalar(0.0), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(-1.0, 1.0),
+        f=lambda t, x, u, args: jnp.stack([jnp.cos(3.0 * t) - 1e7 * x[0], x[0] + u]),
+        h=lambda t, x, u, args: x[1] - u, control_space=dvax.spaces.Euclidean(()),
+    )  # fmt: skip
+    sol = dvax.solve(stiff, jnp.array([0.0, 0.5]), 0.0, 1.0, throw=False)
+    bound = dvax.bound_error(stiff, sol, max_steps=2000)
+    assert np.isinf(bound.x[-1])
+    assert "a larger max_steps of dvax.bound_error" in bound.why
+    with pytest.raises(dvax.InputError, match="an integer ≥ 1"):
+        dvax.bound_error(stiff, sol, max_steps=0)
 
 
 @jax.custom_jvp

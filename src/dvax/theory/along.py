@@ -16,6 +16,7 @@ L̃(s) of the piece that contains s, Gronwall's lemma for e^{−ωt}‖x_c − x
 e^{∫(ω + ML̃)}, which M multiplies once.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -71,7 +72,7 @@ class BoundAlong:
 
     def __init__(
         self, problem: Problem, sol: Solution, times: np.ndarray, end: float,
-        initial_error: float = 0.0, max_steps: int | None = None,
+        initial_error: float = 0.0, max_steps: int = 5_000_000,
     ):  # fmt: skip
         self.problem = problem = current(problem)
         self.dtype = sol.ts.dtype
@@ -82,7 +83,7 @@ class BoundAlong:
         self.initial_error = initial_error
         self.rows: dict[float, _Row] = {}
         self.span = self.end - self.t
-        self.tube = Tube(problem, sol, self.t, self.end)
+        self.tube = Tube(problem, sol, self.t, self.end, max_steps)
         self.length, self.why = self.span / _FIRST_PIECES, ""
         self.before: Piece | None = None
         self.unknown = 0  # pieces in a row with an unknown derivative of the law
@@ -127,7 +128,10 @@ class BoundAlong:
         piece = self.tube.piece(a, b, saved, self.before, self.initial_error)
         self.steps += self.tube.latest_steps
         # A piece that is too long is not like those that follow.
-        self._limit_steps(b, (self.end - b) / (b - a) if isinstance(piece, Piece) else 1.0)
+        is_piece, before = isinstance(piece, Piece), self.tube.looseness
+        self._limit_steps(b, (self.end - b) / (b - a) if is_piece else 1.0, is_piece)
+        if self.tube.is_stopped and self.tube.looseness > before and not self.why:
+            return None
         is_too_long = isinstance(piece, str) or piece.excess(b - a, self.span, at_kink) > 1.0
         if is_too_long and not self.why and b - a > _SHORTEST * self.span:
             self.length = 0.5 * (b - a)
@@ -145,21 +149,22 @@ class BoundAlong:
         self.t, self.before = b, piece
         return piece
 
-    def _limit_steps(self, b: float, more: float) -> None:
+    def _limit_steps(self, b: float, more: float, is_reached: bool) -> None:
         """Say that x_c had too many steps, or loosen its tolerance for `more` pieces like the last."""
-        if self.max_steps is None:
-            return
         left = self.max_steps - self.steps
         if left < 0:
             self.why = (
-                f"the trajectory along which it is proved took {self.steps} steps to t = {b:.6g}"
+                f"the trajectory along which it is proved took {self.steps} steps "
+                f"{'to' if is_reached else 'and did not reach'} t = {b:.6g}"
             )
+        elif self.tube.is_stopped:
+            self.tube.loosen(np.inf)
         else:
             # Steps of order 2 are as long as the root of the tolerance.
             self.tube.loosen((more * self.tube.latest_steps / (left + 1)) ** 2)
 
 
-def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
+def bound_along(problem: Problem, sol: Solution, initial_error: float, max_steps: int) -> Bound:
     """Return the bound of a solution from constants along it. The arguments are checked.
 
     **Raises:** `dvax.InputError` if the code of f and h proves no constants around the initial state.
@@ -167,7 +172,13 @@ def bound_along(problem: Problem, sol: Solution, initial_error: float) -> Bound:
     t0, t1 = (float(sol.setup.setting[name]) for name in ("t0", "t1"))
     last = float(sol.ts[-1])
     end = last if last > t0 else t1
-    return BoundAlong(problem, sol, np.asarray(sol.ts), end, initial_error).bound(sol)
+    along = BoundAlong(problem, sol, np.asarray(sol.ts), end, initial_error, max_steps)
+    bound = along.bound(sol)
+    if along.steps <= max_steps or not bound.why:
+        return bound
+    return dataclasses.replace(
+        bound, why=f"{bound.why}; a larger max_steps of dvax.bound_error follows it further"
+    )
 
 
 def _last(rows: Tree) -> Tree:

@@ -18,18 +18,21 @@ from .status import weakest
 
 
 def bound_error(
-    problem: Problem, sol: Solution, constants: Constants | None = None, *, initial_error: Any = 0.0
-) -> Bound:
+    problem: Problem, sol: Solution, constants: Constants | None = None, *,
+    initial_error: Any = 0.0, max_steps: int = 5_000_000,
+) -> Bound:  # fmt: skip
     """Bound the error of a computed trajectory at its saved times.
 
     **Arguments:** `problem` and `sol`, the solution of it; `constants`, its moduli; `initial_error`,
     a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues from its last
-    saved state. (With M > 1 every piece multiplies the bound by M.)
+    saved state. (With M > 1 every piece multiplies the bound by M.) `max_steps`: without constants,
+    the bound is infinite from where its own run has taken more steps, and the time of the call with it.
 
     **Without constants** the bound is proved along the trajectory, in tubes around pieces of it, from
     the code of f and h: no region has to be given, and errors grow in the bound as those of the
     linearised system do. The problem is solved once more for this, by `ETD2RK` with tolerances of
-    10⁻⁹ to 10⁻⁵, and the distance of `sol` from this run is added: `sol` may be of any method.
+    10⁻⁹ to 10⁻⁵, and the distance of `sol` from this run is added: `sol` may be of any method. Where
+    this run would take more than `max_steps`, its tolerances become up to 100 times larger.
     `x_paper` is then the bound that the constants of each piece give with the bound at its start, and
     `x_sharp` is `x`. With more than 128 unknowns errors grow at the rates of these constants. Where
     `ETD2RK` samples its defect, as for a set whose motion has no rule, the bound is an estimate.
@@ -56,7 +59,7 @@ def bound_error(
     estimate.
 
     **Raises:** `dvax.InputError` if `sol` is not a solution of `problem`, has events with a
-    reset, or `initial_error` is not a number ≥ 0; without constants, if none are proved around the
+    reset, `initial_error` is not a number ≥ 0, or `max_steps` no integer ≥ 1; without constants, if none are proved around the
     initial state, or values are traced.
 
     ```python
@@ -83,6 +86,11 @@ def bound_error(
         return _checked(bound_by_constants(problem, sol, constants, initial_error), sol)
     problem = current(problem)
     check_bounded(problem, sol, initial_error)
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+        raise input_error(
+            "dvax.bound_error(max_steps)", repr(max_steps), "it must be an integer ≥ 1",
+            "Omit it for 5000000",
+        )  # fmt: skip
     error = initial_error.x[-1] if isinstance(initial_error, Bound) else initial_error
     if not _tree.is_concrete(sol.ts, sol.xs, sol.us, sol.setup.setting, sol.setup.args, error):
         raise input_error(
@@ -94,7 +102,7 @@ def bound_error(
             "dvax.bound_error(sol)", "no saved time", "a bound exists at saved times only",
             "Save the end of the run: ts=[t1]",
         )  # fmt: skip
-    return _checked(bound_along(problem, sol, float(np.asarray(error))), sol)
+    return _checked(bound_along(problem, sol, float(np.asarray(error)), max_steps), sol)
 
 
 def _checked(bound: Bound, sol: Solution) -> Bound:

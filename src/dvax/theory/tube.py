@@ -16,6 +16,7 @@ from .. import _tree
 from .._tree import Tree
 from ..errors import input_error
 from ..evolution import ETD2RK, RESULTS, Solution, solve
+from ..evolution.arguments import ADAPTIVE_STEPS
 from ..evolution.results import is_success
 from ..problem import Problem
 from ..programs.slope import Values, interval
@@ -114,8 +115,10 @@ class _Propagation(NamedTuple):
 class Tube:
     """Tubes around x_c, and its pieces."""
 
-    def __init__(self, problem: Problem, sol: Solution, t0: float, end: float):
+    def __init__(self, problem: Problem, sol: Solution, t0: float, end: float, max_steps: int):
         setup = sol.setup
+        # A piece may have a part of all steps, so that there are some for a larger tolerance.
+        self.max_steps = min(max(max_steps // 4, 1), ADAPTIVE_STEPS)
         self.problem, self.args, self.x0 = problem, setup.args, setup.x0
         self.span = end - t0
         # A tube is narrow: to cut it would gain little.
@@ -141,7 +144,8 @@ class Tube:
         # Factors of the tolerances of x_c, and of the smallest reach of a tube; and whether constants
         # need bounds of u.
         self.looseness, self.width, self.limits_u = 1.0, 1.0, False
-        self.latest_steps = 0  # of x_c on the latest piece, whatever became of it
+        # Steps of x_c on the latest piece, whatever became of it, and whether their limit stopped it.
+        self.latest_steps, self.is_stopped = 0, False
         self.is_unbounded = any(
             bool(np.isinf(v.low).any() or np.isinf(v.high).any()) for v in slopes(self.possible)
         )
@@ -268,9 +272,11 @@ class Tube:
         found = solve(
             self.problem, x, a, nodes[-1], self.args, times,
             rtol=self.looseness * self.rtol, atol=self.looseness * self.atol,
-            method=ETD2RK(), constants=self.first, dt0=step, horizon=self.span, throw=False,
+            method=ETD2RK(), constants=self.first, dt0=step, horizon=self.span,
+            max_steps=self.max_steps, throw=False,
         )  # fmt: skip
         self.latest_steps = int(found.stats["steps"])
+        self.is_stopped = bool(found.result == RESULTS.max_steps)
         return found
 
     def _smaller(
