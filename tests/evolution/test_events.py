@@ -622,3 +622,22 @@ def test_zero_is_reached_once_and_not_left():
     v, w = jnp.array([1.0, 0.0, -1.0, -1.0]), jnp.array([0.0, 1.0, 1.0, -2.0])
     assert arrives(v, w, jnp.zeros(4, int)).tolist() == [True, False, True, False]
     assert arrives(v, w, jnp.full(4, 1)).tolist() == [False, False, True, False]
+
+
+@pytest.mark.slow
+def test_rows_at_a_reset_have_the_state_before_it_and_the_end_of_a_run_the_one_behind():
+    clock = dvax.Problem(
+        A=dvax.generators.Zero(), P=dvax.operators.Scaling(1.0), K=dvax.sets.Box(0.0, 5.0),
+        control_space=dvax.spaces.Euclidean(()),
+        f=lambda t, x, u, args: jnp.stack([u, 0.0 * u]), h=lambda t, x, u, args: 1.0 + 0.0 * x[0],
+    )  # fmt: skip
+
+    def rows(at, ts, terminal=False):
+        event = component(0, at, terminal=terminal, reset=lambda t, x, u, args: x.at[1].add(9.0))
+        sol = dvax.solve(clock, jnp.array([0.0, 1.0]), 0.0, 1.0, None, ts, events=[event])
+        return np.round(np.asarray(sol.xs), 12).tolist()
+
+    assert rows(0.5, [0.25, 0.5, 1.0]) == [[0.25, 1.0], [0.5, 1.0], [1.0, 10.0]]
+    assert rows(1.0, [0.5, 1.0]) == [[0.5, 1.0], [1.0, 10.0]]
+    assert rows(1.0, None) == [[1.0, 10.0]] and rows(0.5, None, True) == [[0.5, 10.0]]
+    assert rows(0.0, [0.0, 1.0]) == [[0.0, 10.0], [1.0, 10.0]]

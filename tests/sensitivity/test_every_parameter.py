@@ -104,3 +104,22 @@ def test_derivatives_in_all_data_agree_with_central_differences(method, kind, un
     grad = jax.jit(jax.grad(lambda g: asked(g, "reverse")))(given)
     pairs = zip(*map(jax.tree_util.tree_leaves, (grad, along)), strict=True)
     assert float(sum(jnp.sum(a * b) for a, b in pairs)) == pytest.approx(forward, rel=1e-8)
+
+
+@pytest.mark.slow
+def test_an_adaptive_run_on_an_intersection_has_derivatives_in_both_modes():
+    problem = dvax.Problem(
+        A=generators.Scalar(-0.4), P=dvax.operators.Scaling(1.0),
+        K=lambda t, r: sets.Intersection(sets.Box(-0.6, 0.6), sets.Ball(0.0, r)),
+        f=lambda t, x, u, r: jnp.cos(2 * t) - 0.3 * x + u, h=lambda t, x, u, r: 2 * x - 0.5 * u,
+    )  # fmt: skip
+
+    def end(r, adjoint="reverse"):
+        sol = dvax.solve(
+            problem, jnp.array([1.0, 0.2]), 0.0, 0.5, r, rtol=1e-9, atol=1e-9, adjoint=adjoint
+        )
+        return jnp.sum(sol.xs[-1])
+
+    forward = float(jax.jvp(lambda r: end(r, "forward"), (0.8,), (1.0,))[1])
+    assert float(jax.grad(end)(0.8)) == pytest.approx(forward, rel=1e-8)
+    assert (float(end(0.801)) - float(end(0.799))) / 2e-3 == pytest.approx(forward, rel=1e-5)

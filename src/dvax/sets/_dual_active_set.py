@@ -29,9 +29,9 @@ SLACK = 0.75
 """A row holds with equality if its slack is at most eps^0.75 of its terms: 2e-12 in double precision.
 A violation of this size counts only if the row is far enough from a combination of active rows."""
 
-_INDEPENDENT = 1e-3
+_INDEPENDENT = 1e-11
 """Length of the component of a normal orthogonal to the active normals, from which on violations above
-roundoff count."""
+roundoff count: the normals of rows at a smaller angle may differ by roundoff alone."""
 
 
 class Projection(NamedTuple):

@@ -19,6 +19,9 @@ from .abstract import AbstractSet
 
 _DAMPING = 64.0
 """Multiple of eps that is added to the diagonal of the Newton matrix, relative to its largest value."""
+_LINEAR = 1e-6
+"""Part of the gaps of the rows that a Newton step leaves, from which the dual function counts as linear
+along it."""
 _DEPENDENT = 1e-8
 """Singular value of rows of length one below which they count as dependent."""
 _LINE_SEARCH = 400
@@ -202,8 +205,8 @@ def _nearest(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:  # fmt: skip
     """Return the projection y, the multipliers μ, 1 for entries at no bound and else 0, and the
     z − W⁻¹Rᵀμ of which y is the nearest point in the box; y is NaN if the method failed."""
-    m, n = R.shape
-    width = min(m, n, MAX_ROWS)
+    m = R.shape[0]
+    width = min(m, MAX_ROWS)
     eps = jnp.finfo(z.dtype).eps
     index = jnp.arange(m)
     is_equation = low == high
@@ -222,32 +225,45 @@ def _nearest(
         is_active = is_equation | (s.multiplier != 0) | (index == s.added)
         gap = jnp.where(s.multiplier == 0, excess, gap)
         # The rows of a Newton step: the active ones with the largest gaps.
-        priority = jnp.where(is_active, 1.0 + jnp.abs(gap) / _tolerance(s.y, R, low, high), 0.0)
+        least = _tolerance(s.y, R, low, high)
+        priority = jnp.where(is_active, 1.0 + jnp.abs(gap) / least, 0.0)
         chosen = _largest(priority, width)
         used = is_active[chosen]
         rows = jnp.where(used[:, None], R[chosen], 0.0)
         is_free = (s.shifted > lower) & (s.shifted < upper)
         scaled = rows * jnp.where(is_free, inverse_w, 0.0)[None, :]
-        # Where all entries of a row are at their bounds, the dual function is linear up to the next
-        # piece, however far that is: the step passes the pieces of all entries.
-        rates = jnp.abs(rows * inverse_w[None, :])
-        ahead = jnp.abs(s.shifted - s.y)[None, :] / jnp.where(rates > 0, rates, jnp.inf)
-        is_linear = jnp.sum(jnp.abs(scaled), axis=1) == 0
-        farthest = jnp.where(is_linear, 2.0 * jnp.max(ahead, axis=1, initial=0.0), 0.0)
-        enough = jnp.abs(gap[chosen]) / jnp.where(farthest > 0, farthest, jnp.inf)
-        least_slope = jnp.where(farthest > 0, jnp.minimum(damping[chosen], enough), damping[chosen])
-        diagonal = jnp.where(used, least_slope, 1.0)
+        # A row that holds stays as it is, if it could only be moved by a large change.
+        is_fixed = jnp.all(scaled == 0, axis=1) | (s.added >= 0)
+        pull = jnp.where(is_fixed & (jnp.abs(gap) <= least)[chosen], 0.0, gap[chosen])
+        pull = jnp.where(used, pull, 0.0)
+        diagonal = jnp.where(used, damping[chosen], 1.0)
         matrix = product(scaled, rows.T) + jnp.diag(diagonal)
-        step = solve_constant(matrix, jnp.where(used, gap[chosen], 0.0))
-        step = jnp.where(used, step, 0.0)
-        # A multiplier of an inequality keeps its sign; it leaves the active rows at 0.
+        step = jnp.where(used, solve_constant(matrix, pull), 0.0)
+        # The step of an added row has the sign of its gap, up to rounding: the others hold.
         old = s.multiplier[chosen]
-        towards_zero = ~is_equation[chosen] & (old * step < 0)
-        ratios = jnp.where(towards_zero, -old / jnp.where(towards_zero, step, 1.0), jnp.inf)
-        most = jnp.minimum(1.0, jnp.min(ratios))
+        is_new = (old == 0) & ~is_equation[chosen]
+        step = jnp.where(is_new, jnp.copysign(step, pull), step)
         direction = combine(step, rows)
         change = -inverse_w * direction
-        slope_bound = jnp.sum(step * (s.sums[chosen] - gap[chosen]))
+        # Where the rows are dependent on the free entries, as those whose entries are all at bounds,
+        # the dual function is linear up to the next piece, however far that is, and damping alone
+        # limits the step. It ends where all entries are through their bounds, or the ascent is over:
+        # with larger multipliers rows would lose their digits.
+        ascent = jnp.sum(step * pull)
+        is_linear = jnp.max(jnp.abs(diagonal * step), initial=0.0) > _LINEAR * jnp.max(
+            jnp.abs(pull), initial=0.0
+        )
+        speed = jnp.where(lower < upper, jnp.abs(change), 0.0)
+        is_moved = speed > _LINEAR * jnp.max(speed, initial=0.0)
+        rate = jnp.where(is_moved, jnp.abs(direction), jnp.inf)
+        inside = jnp.minimum(upper - lower, ascent / rate)
+        farthest = 2.0 * jnp.max((jnp.abs(s.shifted - s.y) + inside) / (inverse_w * rate))
+        full = jnp.where(is_linear & jnp.any(is_moved), farthest, 1.0)
+        # A multiplier of an inequality keeps its sign; it leaves the active rows at 0.
+        towards_zero = ~is_equation[chosen] & (old * step < 0)
+        ratios = jnp.where(towards_zero, -old / jnp.where(towards_zero, step, 1.0), jnp.inf)
+        most = jnp.minimum(full, jnp.min(ratios))
+        slope_bound = jnp.sum(step * (s.sums[chosen] - pull))
         length = _line_search(s.shifted, change, lower, upper, direction, slope_bound, most, eps)
         leaves = towards_zero & (ratios <= length)
         new = jnp.where(leaves, 0.0, old + length * step)
@@ -295,7 +311,9 @@ def _tolerance(y: jax.Array, R: Any, low: Any, high: Any) -> jax.Array:
         jnp.where(jnp.isfinite(high), jnp.abs(high), 0.0),
     )
     lengths = jnp.sqrt(jnp.sum(R * R, axis=1))
-    return jnp.finfo(y.dtype).eps ** SLACK * (bound + lengths * jnp.sqrt(jnp.sum(y * y)))
+    eps, tiny = jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).tiny
+    # Not 0, where y or a row is 0: gaps are divided by it.
+    return lax.stop_gradient(eps**SLACK * (bound + lengths * jnp.sqrt(jnp.sum(y * y))) + tiny)
 
 
 def _line_search(

@@ -244,7 +244,7 @@ def _least_squares(g: Any, b: Tree) -> Tree:
 
     if flat.size <= _MAX_DENSE_SIZE:
         matrix = jax.jacfwd(flat_g)(jnp.zeros_like(flat))
-        rtol = jnp.sqrt(jnp.finfo(flat.dtype).eps)
+        rtol = float(jnp.finfo(flat.dtype).eps) ** 0.5  # no array: `pinv` keeps what it is given
         return unflatten(jnp.linalg.pinv(matrix, rtol=rtol) @ flat)
     transposed = jax.linear_transpose(flat_g, flat)
 

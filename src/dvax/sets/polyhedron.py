@@ -35,9 +35,9 @@ _ROUNDINGS = 8.0
 class Polyhedron(AbstractSet):
     """K = {y : G y ≤ d, E y = e}, with plain sums (G y)ₖ = Σᵢ Gₖᵢ yᵢ whatever the space's weights.
 
-    A dual active-set method determines the nearest point and its active rows, exactly up to roundoff
-    (relative 2e-12 in double precision). The optimality conditions are then checked; the result is
-    NaN if the check fails. The derivative, in z, G, d, E and e, is that of the projection onto the
+    A dual active-set method determines the nearest point and its active rows, exactly up to roundoff,
+    which moves y by as much over the smallest angle between active rows. The optimality conditions are
+    then checked; the result is NaN if the check fails. The derivative, in z, G, d, E and e, is that of the projection onto the
     active rows. A row that holds with equality counts as active, even with a zero multiplier. A
     change of one of several identical rows is distributed over all of them.
 
@@ -188,6 +188,9 @@ def _reduce(root: jax.Array, G: Any, d: Any, E: Any, e: Any) -> _Reduced:
     roundoff = float(jnp.finfo(root.dtype).eps) ** dual.SLACK
     is_long = jnp.sum(rows * rows, axis=1) > roundoff**2
     rows, scale = normalise_rows(jnp.where(is_long[:, None], rows, 0.0))
+    # The scale of a short row makes its roundoff large, which would not be in the null space.
+    rows, again = normalise_rows(jax.vmap(reduced.onto_null_space)(rows))
+    scale = scale * again
     bounds = bounds / scale
     return reduced._replace(
         rows=rows,

@@ -59,7 +59,8 @@ def bound_error(
     estimate.
 
     **Raises:** `dvax.InputError` if `sol` is not a solution of `problem`, has events with a
-    reset, `initial_error` is not a number ≥ 0, or `max_steps` no integer ≥ 1; without constants, if none are proved around the
+    reset, `initial_error` is not a number ≥ 0, or `max_steps` no integer ≥ 1;
+    without constants, if none are proved around the
     initial state, or values are traced.
 
     ```python

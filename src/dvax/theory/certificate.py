@@ -34,11 +34,16 @@ from .._tree import Tree
 from ..errors import InputProblem, Problems, input_error
 from ..evolution import Implicit, Solution, between, disturbance, gronwall
 from ..evolution.defect import ROUNDINGS
+from ..evolution.enclosed_projection import rounding_of
+from ..evolution.interpolated_response import Place
 from ..evolution.setup import Setup
 from ..evolution.solve import run_again
 from ..generators import AbstractGenerator, AbstractMatrixFree, Growth, Product
 from ..operators import AbstractOperator, Spectrum
 from ..problem import Problem
+from ..sets import ConstrainedBox, Polyhedron
+from ..sets._face import face
+from ..sets._library import sets_in
 from .constants import Constants
 from .domain import Domain
 from .error_ellipsoid import Disturbances
@@ -152,7 +157,9 @@ def disturbances(problem: Problem, sol: Solution, c: Constants) -> tuple[Disturb
     """Return, for each saved time of a solution whose defect is known, what disturbs x, late errors
     being its motion within a few roundings of t; and the distance of u from the solution of the law."""
     args, t0 = _tree.as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
-    of_x, of_u = _roundoff(current(problem), args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
+    of_x, of_u = _roundoff(
+        current(problem), args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us, c.norm_P_inv
+    )
     law = sol.law_residual, sol.law_step, of_u
     total, completed = (
         np.asarray(disturbance(c, *(np.asarray(v, float) for v in parts)))
@@ -205,7 +212,9 @@ def _bound_error(problem: Problem, sol: Solution, constants: Constants, initial:
         measured = _solve_again(sol, constants)
         distance = jax.vmap(lambda a, b: space.norm(_tree.sub(a, b)))(measured.xs, sol.xs)
     args, t0 = _tree.as_arrays(sol.setup.args), jnp.asarray(sol.setup.setting["t0"], sol.ts.dtype)
-    of_x, of_u = _roundoff(problem, args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us)
+    of_x, of_u = _roundoff(
+        problem, args, t0, sol.setup.x0, sol.ts, sol.xs, sol.us, constants.norm_P_inv
+    )
     distance = _tree.prepare(operator.add, distance, of_x)
     defects = _defects(measured, constants)
     law = sol.law_residual, sol.law_step, of_u
@@ -288,22 +297,29 @@ def _overflow(x: jax.Array) -> str:
 
 @eqx.filter_jit
 def _roundoff(
-    problem: Problem, args: Any, t0: Any, x0: Any, ts: Any, xs: Any, us: Any
+    problem: Problem, args: Any, t0: Any, x0: Any, ts: Any, xs: Any, us: Any, norm_P_inv: Any
 ) -> tuple[jax.Array, jax.Array]:
     """Return, for each saved time, how far x moves within a few roundings of t, and the roundoff of u.
 
     The roundoff of the steps is part of their defect.
     """
     generator, (state, control) = problem.generator(args), problem.spaces(x0)
+    operator = problem.operator(args)
 
-    def sizes(t: Any, x: Any, u: Any) -> tuple[Any, Any]:
+    def sizes(t: Any, x: Any, u: Any) -> tuple[Any, Any, Any]:
         rate = _tree.add(generator.apply(x), problem.f(t, x, u, args))
-        return state.norm(rate), control.norm(u)
+        K = problem.set_at(t, args)
+        projected = jnp.zeros_like(control.norm(u))
+        if any(isinstance(part, Polyhedron | ConstrainedBox) for part in sets_in(K)):
+            # Rows that are nearly parallel move y by many times their own roundoff.
+            y = operator.apply(u)
+            projected = rounding_of(K, control, Place(y, y, face(K, y, control)))
+        return state.norm(rate), control.norm(u), projected
 
-    speed, size = jax.vmap(sizes)(ts, xs, us)
+    speed, size, projected = jax.vmap(sizes)(ts, xs, us)
     largest = jnp.maximum(jnp.abs(t0), jnp.abs(ts))
     unit = ROUNDINGS * jnp.finfo(ts.dtype).eps
-    return unit * largest * speed, unit * size
+    return unit * largest * speed, unit * size + norm_P_inv * projected
 
 
 @jax.jit

@@ -8,6 +8,9 @@ import jax.tree_util as jtu
 
 from .. import sets
 from ..sets._dual_active_set import SLACK
+from ..sets._face import face
+from ..sets._library import sets_in
+from ..spaces import AbstractSpace
 
 
 class ProjectionError(NamedTuple):
@@ -23,21 +26,32 @@ class ProjectionError(NamedTuple):
     relative: Any = 0.0
 
 
-def rounding_of_w(K: sets.AbstractSet, like: Any, size: Any, norm_F: Any, step: Any) -> jax.Array:
+def rounding_of_w(
+    K: sets.AbstractSet, like: Any, size: Any, norm_F: Any, step: Any, condition: Any = 1.0
+) -> jax.Array:
     """Return the rounding error of w = F(y) − F(b) + (b − y)/λ, without that of F, for y = proj_K(z).
 
     `size` = ‖y‖, `norm_F` is the magnitude of the values of F, and `step` is λ. The projection onto an
     interval is exact; that onto another set is assumed accurate to (8 + n)ε relative to the magnitudes
-    in `projection_error`.
+    in `projection_error`, times the condition of the active rows.
     """
     eps = jnp.finfo(jnp.result_type(*jtu.tree_leaves(like))).eps
     if K.intervals(like) is not None:
         return eps * (2 * size / step + 8 * norm_F)
     K_error, entries = projection_error(K), sum(leaf.size for leaf in jtu.tree_leaves(like))
     operations = 2 * (8 + entries)
-    error_y = operations * K_error.condition * eps * (size + K_error.data)
-    error_y += K_error.relative * (size + step * norm_F)
+    error_y = operations * condition * K_error.condition * eps * (size + K_error.data)
+    error_y += condition * K_error.relative * (size + step * norm_F)
     return error_y / step + (8 + operations) * eps * norm_F
+
+
+def condition_at(K: sets.AbstractSet, y: Any, space: AbstractSpace) -> Any:
+    """Return the factor by which roundoff in the rows that hold with equality at y moves a projection
+    onto K, as far as it is known."""
+    if not any(isinstance(part, sets.Polyhedron | sets.ConstrainedBox) for part in sets_in(K)):
+        return 1.0
+    found = face(K, y, space)
+    return 1.0 if found is None else found.condition
 
 
 _STOPPING_FACTOR = 16.0

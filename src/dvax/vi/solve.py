@@ -22,7 +22,7 @@ from .auto import Auto
 from .certificate import certify
 from .iteration import first_step, without_derivatives
 from .parameters import MODULUS, TOLERANCE
-from .projection_error import rounding_of_w
+from .projection_error import condition_at, rounding_of_w
 from .weighted import Weighted, reject_moduli_of_product
 
 _MISSED_TOLERANCE = RESULTS.max_steps, RESULTS.stalled, RESULTS.cycling, RESULTS.singular
@@ -171,13 +171,14 @@ def _solve_and_certify(
     answer = solver.solve(frozen, y0, solver_tol if gamma is None else 0.5 * solver_tol)
     vi, y = without_derivatives(frozen), jax.lax.stop_gradient(answer.y)
     residual, distance = answer.residual, jnp.zeros_like(answer.residual)
-    rounding, proved = rounding_of(vi, y, answer.residual_step, residual)
+    condition = condition_at(K, y, space)
+    rounding, proved = rounding_of(vi, y, answer.residual_step, residual, condition)
     if not solver.certifies:
         # A projection step from y has a certificate, which bounds the error of y by the triangle
         # inequality.
         step = first_step(vi, y, vi.F(y))
         projected = certify(vi.F, vi.K, space, y, step)
-        projected_rounding, _ = rounding_of(vi, projected.y, step, projected.norm)
+        projected_rounding, _ = rounding_of(vi, projected.y, step, projected.norm, condition)
         residual = jnp.where(answer.residual > 0, answer.residual, jnp.inf)
         # A formula has no step of its own, and so no rounding of a certificate.
         rounding = jnp.where(jnp.isfinite(residual), rounding, jnp.inf)
@@ -218,19 +219,21 @@ def missed_tolerance(result: RESULTS) -> Any:
     return functools.reduce(jnp.logical_or, [result == code for code in _MISSED_TOLERANCE])
 
 
-def rounding_of(vi: FrozenVI, y: Tree, step: Any, residual: Any) -> tuple[jax.Array, bool]:
+def rounding_of(
+    vi: FrozenVI, y: Tree, step: Any, residual: Any, condition: Any = 1.0
+) -> tuple[jax.Array, bool]:
     """Return a bound on ‖fl(w) − w‖ for some w ∈ F(y) + N_K(y), and whether the error of F is proved.
 
     With z = fl(b − λF(b)) and y = proj_K(z), n = (z − y)/λ is in N_K(y), whatever the error of
     F(b). The computed w is F(y) + [(b − y)/λ − F(b)] with λ = `step`. It differs from F(y) + n by
     the error of F(y), the error of z divided by λ, and the rounding of the terms (`rounding_of_w`). A
-    norm that underflows is less than that of n numbers of √tiny.
+    norm that underflows is less than that of n numbers of √tiny. `condition`: of the active rows of K.
     """
     norm, value = vi.space.norm, vi.F(y)
     error, proved = rounding_error(vi.F, y)
     kind = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y)))
     entries = sum(leaf.size for leaf in jtu.tree_leaves(y))
-    error_w = rounding_of_w(vi.K, y, norm(y), norm(value) + residual, step)
+    error_w = rounding_of_w(vi.K, y, norm(y), norm(value) + residual, step, condition)
     # The factor 1.01 covers the rounding of the norms and of this sum.
     underflow = jnp.sqrt(entries * jnp.asarray(kind.tiny, error_w.dtype))
     bound = 1.01 * (norm(error) + error_w) + underflow

@@ -117,4 +117,4 @@ def test_progress_of_a_sweep_counts_members_and_warns_of_failures(
     assert lines[0] == "5 members, 1 complete"
     assert lines[2] == "warning: member 2 (model.rate = 13.0) failed: no model"
     shown = [line.rpartition(",")[0] for line in lines[1:2] + lines[3:]]
-    assert shown == [f"{n} of 5 members ({25 * n - 25}%)" for n in (2, 3, 4, 5)]
+    assert shown == [f"{n} of 4 missing members ({25 * n}%)" for n in (1, 2, 3, 4)]

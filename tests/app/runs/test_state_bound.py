@@ -82,7 +82,9 @@ def test_the_bound_of_a_plain_run_is_proved_along_the_trajectory(tmp_path):
 def test_a_bound_that_ends_says_why_and_what_to_try(tmp_path):
     file = written(tmp_path / "short", TABLE.replace("frames = 2", "frames = 2\nbound_steps = 50"))
     told = call("run", file, "-o", tmp_path / "run")
-    assert "not finite" in told and "steps and did not reach" in told and "larger bound_steps" in told
+    assert (
+        "not finite" in told and "steps and did not reach" in told and "larger bound_steps" in told
+    )
     found = bound(tmp_path / "run")
     assert not np.isfinite(float(found["value"])) and "steps and did not reach" in found["why"]
 

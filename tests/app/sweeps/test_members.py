@@ -164,6 +164,8 @@ def test_cells_of_a_table_are_numbers_flags_and_texts(tmp_path):
         ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { mean = 1.0, deviation = 0.0 }\n',
          "positive"),
         ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { low = 1.0 }\n', "m.a.high: got nothing"),
+        ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { low = 3.0, high = 2.0 }\n',
+         "m.a.low: got 3.0, and high = 2.0"),
         ('[sample]\ncount = 4\n[sample.between]\n"m.a" = { low = 1.5, high = 3, whole = true }\n',
          "whole numbers have whole ends"),
         ('[sample]\nmethod = "soboll"\ncount = 4\n[sample.between]\n"m.a" = [0.0, 1.0]\n', "'sobol'"),

@@ -159,8 +159,8 @@ def member_listener(listener: Listener) -> Callable[[Mapping[str, Any]], None]:
             if event["status"] == "failed":
                 message = f"{_who(event)} failed: {event['reason']}"
                 listener({"event": "warning", "message": message})
-            # The time left is that of the members of this call.
-            where = f"{complete + done} of {count} members"
+            # The share and the time left are those of the members of this call.
+            where = f"{done} of {count - complete} {'missing ' if complete else ''}members"
             listener({"event": "progress", "t": done, "t_end": count - complete, "where": where})
 
     return listen

@@ -107,6 +107,11 @@ def drawn(place: str, key: str, given: Any, points: np.ndarray) -> Parameter:
         return from_numbers(key, numbers, unit)
     if isinstance(given, Mapping):
         low, high, unit = _ends(place, given, "low", "high", ("low", "high", "spacing", "whole"))
+        if low > high:
+            raise input_error(
+                f"{place}.low", f"{given['low']!r}, and high = {given['high']!r}",
+                "low is at most high", "Exchange them, if the range is meant",
+            )  # fmt: skip
         if not _is_whole(place, given, unit):
             return from_numbers(key, _scaled(place, given, low, high, points), unit)
         # Both ends as likely as the numbers between them.
