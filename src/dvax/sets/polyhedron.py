@@ -37,9 +37,9 @@ class Polyhedron(AbstractSet):
 
     A dual active-set method determines the nearest point and its active rows, exactly up to roundoff,
     which moves y by as much over the smallest angle between active rows. The optimality conditions are
-    then checked; the result is NaN if the check fails. The derivative, in z, G, d, E and e, is that of the projection onto the
-    active rows. A row that holds with equality counts as active, even with a zero multiplier. A
-    change of one of several identical rows is distributed over all of them.
+    then checked; the result is NaN if the check fails. The derivative, in z, G, d, E and e, is that of
+    the projection onto the active rows. A row that holds with equality counts as active, even with a
+    zero multiplier. A change of one of several identical rows is distributed over all of them.
 
     Each bound on a single unknown is a row here. With many of them and few other rows,
     `dvax.sets.ConstrainedBox` is the same set with a faster projection.
