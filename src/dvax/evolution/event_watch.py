@@ -31,7 +31,6 @@ from .law_tolerance import one_direction
 from .outcome import Record
 from .results import RESULTS
 from .stepper import Stepper, dense_output, one_sided_time
-from .time_derivatives import midpoint, velocity
 
 _WINDOW, _SMALLEST_WINDOW = 1e-6, 1e-12
 """Largest and smallest distance of an event from the end of the step that ends behind it, in lengths of
@@ -177,12 +176,13 @@ class EventWatch(eqx.Module):
         return error * jnp.maximum(*map(jnp.abs, changes))
 
     def along_flow(
-        self, flow: Flow, t: Any, x: Tree, guess: Tree | None, s: Any = 0.0
+        self, flow: Flow, t: Any, x: Tree, guess: Tree | None
     ) -> tuple[jax.Array, jax.Array]:
-        """Return values and slopes at t + s on the solution through (t, x)."""
-        value = lambda s: self.values(flow, t + s, _flow_by(flow, t, x, s), guess)  # noqa: E731
-        s = jnp.asarray(s, t.dtype)
-        return jax.jvp(value, (s,), (jnp.ones_like(s),))
+        """Return values and slopes on the solution through (t, x)."""
+        found, solved = flow.rate(t, x, guess), flow.with_known_response()
+        velocity = _tree.add(flow.generator.apply(x), found.value)
+        value = lambda t, x: self.values(solved, t, x, found.y)  # noqa: E731
+        return jax.jvp(value, (t, x), (jnp.ones_like(t), velocity))
 
     def start(self, flow: Flow, t0: Any, x0: Tree) -> tuple["EventWatch", Tree]:
         """Return the watch with the events at t0, those whose functions are zero there and leave zero
@@ -431,31 +431,43 @@ class EventWatch(eqx.Module):
     ) -> tuple[Tree, jax.Array]:
         """Return the state at t after the resets of the events that fired at most `widths` before t, in
         the order of the list, given the state x without these resets; and s ≤ 0 for each event."""
-        shifts = [jnp.zeros_like(t)] * len(self.events)
-        for k in self._resets:
+        resets = jnp.asarray(self._resets, int)
+        if not self._resets:
+            return x, jnp.zeros_like(widths)
+
+        def shift(k: Any) -> Any:
             find = partial(self._shift, flow, t, x, k, fired[k], widths[k], guess)
-            shifts[k] = lax.cond(any_lane(fired[k]), find, lambda: jnp.zeros_like(t))
-        for k in self._resets:
-            change = partial(self._change, flow, t, shifts[k], k, guess)
-            x = _tree.where(fired[k], lax.cond(any_lane(fired[k]), change, lambda x: x, x), x)
-        return x, jnp.stack(shifts)
+            return lax.cond(any_lane(fired[k]), find, lambda: jnp.zeros_like(t))
 
-    def _change(self, flow: Flow, t: Any, s: Any, k: int, guess: Tree | None, x: Tree) -> Tree:
-        """Return Φ_{−s} R Φ_s(x) for the reset R of event k."""
-        return _flow_by(flow, t + s, self._reset(flow, t, s, k, guess, x)[1], -s)
+        shifts = jnp.zeros_like(widths).at[resets].set(lax.map(shift, resets))
 
-    def _reset(
-        self, flow: Flow, t: Any, s: Any, k: int, guess: Tree | None, x: Tree
-    ) -> tuple[Tree, Tree]:
-        """Return the states before and behind event k at t + s."""
-        before = _flow_by(flow, t, x, s)
-        reset = self.events[k].reset
-        if reset is None:
-            return before, before
-        u = _response(flow, t + s, before, guess)
-        after = reset(t + s, before, u, flow.args)
-        # A reset may return whole numbers.
-        return before, jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), after, before)
+        def change(x: Tree, k: Any) -> tuple[Tree, None]:
+            """Apply Φ_{−s} R Φ_s for the reset R of event k and its s."""
+
+            def changed(x: Tree) -> Tree:
+                then = t + shifts[k]
+                after = self._behind(flow, then, _flow_by(flow, t, x, shifts[k]), k, guess)
+                return _flow_by(flow, then, after, -shifts[k])
+
+            new = lax.cond(any_lane(fired[k]), changed, lambda x: x, x)
+            return _tree.where(fired[k], new, x), None
+
+        return lax.scan(change, x, resets)[0], shifts
+
+    def _behind(self, flow: Flow, t: Any, x: Tree, k: Any, guess: Tree | None) -> Tree:
+        """Return the state behind event number k at (t, x)."""
+        if not self._resets:
+            return x
+        u = _response(flow, t, x, guess)
+
+        def of(event: Event, x: Tree) -> Tree:
+            if event.reset is None:
+                return x
+            # A reset may return whole numbers.
+            after = event.reset(t, x, u, flow.args)
+            return jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), after, x)
+
+        return lax.switch(k, [partial(of, event) for event in self.events], x)
 
     def _shift(
         self, flow: Flow, t: Any, x: Tree, k: Any, fired: Any, width: Any, guess: Tree | None
@@ -470,7 +482,7 @@ class EventWatch(eqx.Module):
 
         def newton(number: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
             s = carry[0] - lefts[number]
-            values, slopes = self.along_flow(flow, t, x, guess, s)
+            values, slopes = self.along_flow(flow, t + s, _flow_by(flow, t, x, s), guess)
             slope = slopes[k]
             return s - values[k] / jnp.where(slope == 0, 1.0, slope), slope != 0
 
@@ -498,7 +510,7 @@ class EventWatch(eqx.Module):
             x=jtu.tree_map(lambda a, b: jnp.where(_tree.wide(at_start, a), b, a), rows.x, x0),
         )
         valid = jnp.arange(self.max_events) < count
-        guess, n = flow.guess(x0), len(self.events)
+        guess = flow.guess(x0)
 
         def one(before: tuple[Any, Tree], given: tuple[Any, Rows]) -> tuple[Any, Any]:
             valid, row = given
@@ -508,9 +520,9 @@ class EventWatch(eqx.Module):
                 # Events at the end of one step see the states that the earlier ones left.
                 x = _tree.where(row.at_end & (step == row.step), x, row.x)
                 s = self._shift(flow, row.time, row.x, row.index, valid, row.width, guess)
-                branches = [partial(self._reset, flow, row.time, s, k, guess) for k in range(n)]
-                seen, after = lax.switch(row.index, branches, x)
-                kept = _flow_by(flow, row.time + s, after, -s)
+                seen = _flow_by(flow, row.time, x, s)
+                after = self._behind(flow, row.time + s, seen, row.index, guess)
+                kept = _flow_by(flow, row.time + s, after, -s) if self._resets else x
                 step = jnp.where(row.at_end, row.step, -2)
                 return step, row.time + s, seen, after, kept
 
@@ -547,8 +559,14 @@ def _beyond(error: Any, values: jax.Array) -> jax.Array:
 
 
 def _flow_by(flow: Flow, t: Any, x: Tree, s: Any) -> Tree:
-    """Return Φ_s(x) up to O(s³)."""
-    return midpoint(x, s, velocity, t, flow)
+    """Return Φ_s(x) by one step of the midpoint rule, for an s so short that the response in its middle
+    has the value of that at t. Its derivatives there are its own, so that two derivatives of Φ_s are
+    exact at s = 0."""
+    found, solved = flow.rate(t, x, flow.guess(x)), flow.with_known_response()
+    first = _tree.add(flow.generator.apply(x), found.value)
+    middle = _tree.add(x, _tree.scale(0.5 * s, first))
+    there = solved.rate(t + 0.5 * s, middle, found.y).value
+    return _tree.add(x, _tree.scale(s, _tree.add(flow.generator.apply(middle), there)))
 
 
 def _ulp(t: Any) -> Any:
