@@ -217,7 +217,7 @@ def test_dense_output_of_a_bouncing_ball_is_that_of_each_flight():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("restitution", [0.5, 0.0])
+@pytest.mark.parametrize("restitution", [0.5, 0.1, 1e-3])
 def test_events_that_accumulate_end_the_run_with_a_message(restitution):
     given = *BALL[:2], jnp.asarray(restitution)
     with pytest.raises(dvax.SolveError, match="accumulate") as caught:
@@ -226,6 +226,17 @@ def test_events_that_accumulate_end_the_run_with_a_message(restitution):
     assert solution.result == dvax.RESULTS.max_events
     assert solution.events.ts[-1] <= 3.0 + 1e-6  # the sum of all flights
     assert any(fix.option == "max_events" for fix in caught.value.fixes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("height", [0.3, 1.0, 1.7])
+def test_a_ball_that_a_reset_brings_to_rest_falls_on(height):
+    """The event has happened, whatever the sign of the roundoff of g behind it."""
+    gravity = 2.0
+    sol = bounce(height, gravity, jnp.asarray(0.0), max_events=100, t1=4.0)
+    fall = np.sqrt(2 * height / gravity)
+    np.testing.assert_allclose(sol.events.ts, [fall], rtol=1e-9)
+    assert float(sol.xs[-1, X]) == pytest.approx(-0.5 * gravity * (4.0 - fall) ** 2, rel=1e-8)
 
 
 @pytest.mark.thorough

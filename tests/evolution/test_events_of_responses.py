@@ -119,3 +119,30 @@ def test_a_response_that_stays_at_its_bound_after_a_reset_has_no_second_event():
     times = np.asarray(sol.events.ts)[np.isfinite(sol.events.ts)]
     assert len(times) == 2 and np.diff(times)[0] > 0.05
     assert int(sol.stats["steps"]) < 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("entries", [2, 3, 40])
+def test_a_response_that_turns_along_its_bound_arrives_there_once(entries):
+    """u = proj(a(t) e(t)) with |e| = 1 and a growing: it reaches the sphere at a = ½, and goes around
+    on it through all directions of a plane. Roundoff of g there is no event."""
+    ball, space = dvax.sets.Ball(np.zeros(entries), RADIUS), dvax.spaces.Euclidean((entries,))
+
+    def h(t, x, u, q):
+        turned = jnp.zeros(entries).at[0].set(jnp.cos(q[1] * t + q[0]))
+        return 2.0 * (0.2 + t) * turned.at[1].set(jnp.sin(q[1] * t + q[0])) - u
+
+    of = dvax.Problem(
+        A=dvax.generators.Scalar(-1.0), P=dvax.operators.Scaling(1.0), K=ball, control_space=space,
+        f=lambda t, x, u, q: u[0] + 0.0 * x, h=h,
+    )  # fmt: skip
+    event = dvax.Event(GAPS["ball"], direction=-1, reset=lambda t, x, u, q: x + 1.0)
+
+    @jax.jit
+    def times(q):
+        return dvax.solve(of, 0.0, 0.0, 2.0, q, events=[event], max_events=8, throw=False).events.ts
+
+    for phase in (0.0, 0.7, 1.6, 3.0):
+        for speed in (1.0, 7.0):
+            found = np.asarray(times(jnp.array([phase, speed])))
+            assert np.isfinite(found).sum() == 1 and abs(found[0] - 0.3) <= 1e-9

@@ -27,10 +27,10 @@ from .._tree import Tree
 from .event import Event, Events
 from .event_search import RESTART, Walk, arrives, next_event, touches
 from .flow import Flow
-from .law_tolerance import one_direction
 from .outcome import Record
 from .results import RESULTS
 from .stepper import Stepper, dense_output, one_sided_time
+from .time_derivatives import midpoint, velocity
 
 _WINDOW, _SMALLEST_WINDOW = 1e-6, 1e-12
 """Largest and smallest distance of an event from the end of the step that ends behind it, in lengths of
@@ -54,6 +54,9 @@ _ROUNDINGS = 1024.0
 
 _ROUNDINGS_OF_U = 8.0
 """Roundoff of u, in roundings of its largest entry."""
+
+_FEW_ENTRIES = 32
+"""Number of entries of u up to which slopes in u are derivatives by forward mode."""
 
 _LAW_WINDOW, _LAW_ERRORS = 4.0, 300.0
 """Errors of the law, in its tolerances, by which an event may lie before the end of a step that ends
@@ -161,19 +164,17 @@ class EventWatch(eqx.Module):
         )
 
     def _law_error(self, flow: Flow, t: Any, x: Tree, guess: Tree | None) -> jax.Array:
-        """Return by how much values differ with responses that all count as solved, up to roundoff, as
-        estimated from their change along two directions."""
+        """Return by how much values differ with responses that all count as solved, up to roundoff, if
+        each entry has the largest error."""
         y = flow.rate(t, x, None).y if guess is None else guess
         size = jnp.max(jnp.stack([jnp.max(jnp.abs(v), initial=0.0) for v in jtu.tree_leaves(y)]))
         error = _ROUNDINGS_OF_U * jnp.finfo(size.dtype).eps * size
         if flow.iterates:
             error += flow.law_tol(t, x, y)
         values = lambda y: self._at(t, x, flow.operator.inverse(y), flow.args)  # noqa: E731
-        direction = one_direction(y)
-        # With signs that alternate, since the changes of two entries may cancel.
-        other = jtu.tree_map(_alternating, direction)
-        changes = (jax.jvp(values, (y,), (d,))[1] for d in (direction, other))
-        return error * jnp.maximum(*map(jnp.abs, changes))
+        is_short = sum(leaf.size for leaf in jtu.tree_leaves(y)) <= _FEW_ENTRIES
+        rows = jtu.tree_leaves((jax.jacfwd if is_short else jax.jacrev)(values)(y))
+        return error * sum(jnp.sum(jnp.abs(row.reshape(len(row), -1)), axis=1) for row in rows)
 
     def along_flow(
         self, flow: Flow, t: Any, x: Tree, guess: Tree | None
@@ -288,6 +289,10 @@ class EventWatch(eqx.Module):
             crossed = now & (values != 0) & (jnp.sign(values) == jnp.sign(reached))
             bent = jnp.abs(values) < _STRAIGHT * jnp.abs(slopes * shifts)
             accumulates |= jnp.any(crossed & bent)
+            # Where g is zero up to its rounding, its sign is that of its slope: 0 behind a reset to
+            # rest, so that the event does not happen again where g goes on.
+            is_zero = now & (jnp.abs(values) <= self._rounding(watched.sizes))
+            values = jnp.where(is_zero, jnp.sign(slopes) * jnp.abs(values), values)
             after = inside._replace(
                 values=jnp.where(at_end, values, inside.values),
                 slopes=jnp.where(at_end, slopes, inside.slopes),
@@ -431,15 +436,15 @@ class EventWatch(eqx.Module):
     ) -> tuple[Tree, jax.Array]:
         """Return the state at t after the resets of the events that fired at most `widths` before t, in
         the order of the list, given the state x without these resets; and s ≤ 0 for each event."""
-        resets = jnp.asarray(self._resets, int)
+        resets, none = jnp.asarray(self._resets, int), jnp.zeros(len(self.events), t.dtype)
         if not self._resets:
-            return x, jnp.zeros_like(widths)
+            return x, none
 
         def shift(k: Any) -> Any:
             find = partial(self._shift, flow, t, x, k, fired[k], widths[k], guess)
             return lax.cond(any_lane(fired[k]), find, lambda: jnp.zeros_like(t))
 
-        shifts = jnp.zeros_like(widths).at[resets].set(lax.map(shift, resets))
+        shifts = none.at[resets].set(lax.map(shift, resets))
 
         def change(x: Tree, k: Any) -> tuple[Tree, None]:
             """Apply Φ_{−s} R Φ_s for the reset R of event k and its s."""
@@ -547,11 +552,6 @@ def _response(flow: Flow, t: Any, x: Tree, guess: Tree | None) -> Tree:
     return flow.operator.inverse(flow.rate(t, x, guess).y)
 
 
-def _alternating(leaf: jax.Array) -> jax.Array:
-    signs = 1.0 - 2.0 * (jnp.arange(leaf.size, dtype=leaf.dtype) % 2.0)
-    return leaf * signs.reshape(leaf.shape)
-
-
 def _beyond(error: Any, values: jax.Array) -> jax.Array:
     """Return the values, and 0 within their error: there they have no sign, as those of a response that
     stays at a bound."""
@@ -559,14 +559,8 @@ def _beyond(error: Any, values: jax.Array) -> jax.Array:
 
 
 def _flow_by(flow: Flow, t: Any, x: Tree, s: Any) -> Tree:
-    """Return Φ_s(x) by one step of the midpoint rule, for an s so short that the response in its middle
-    has the value of that at t. Its derivatives there are its own, so that two derivatives of Φ_s are
-    exact at s = 0."""
-    found, solved = flow.rate(t, x, flow.guess(x)), flow.with_known_response()
-    first = _tree.add(flow.generator.apply(x), found.value)
-    middle = _tree.add(x, _tree.scale(0.5 * s, first))
-    there = solved.rate(t + 0.5 * s, middle, found.y).value
-    return _tree.add(x, _tree.scale(s, _tree.add(flow.generator.apply(middle), there)))
+    """Return Φ_s(x) up to O(s³)."""
+    return midpoint(x, s, velocity, t, flow)
 
 
 def _ulp(t: Any) -> Any:
