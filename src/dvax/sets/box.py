@@ -78,7 +78,7 @@ class Box(AbstractSet):
         return [z - lower, upper - z]
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree]:
-        def one(bound: jax.Array) -> jax.Array:
+        def one(bound: Any) -> jax.Array:
             # Bounds given as Python numbers take the type of `like`.
             common = jnp.result_type(bound, like)
             bound = bound if bound.dtype == common else jnp.asarray(bound, common)
