@@ -116,10 +116,12 @@ def test_an_adaptive_run_on_an_intersection_has_derivatives_in_both_modes():
 
     def end(r, adjoint="reverse"):
         sol = dvax.solve(
-            problem, jnp.array([1.0, 0.2]), 0.0, 0.5, r, rtol=1e-9, atol=1e-9, adjoint=adjoint
+            problem, jnp.array([1.0, 0.2]), 0.0, 0.5, r, rtol=1e-10, atol=1e-10, adjoint=adjoint
         )
         return jnp.sum(sol.xs[-1])
 
     forward = float(jax.jvp(lambda r: end(r, "forward"), (0.8,), (1.0,))[1])
     assert float(jax.grad(end)(0.8)) == pytest.approx(forward, rel=1e-8)
-    assert (float(end(0.801)) - float(end(0.799))) / 2e-3 == pytest.approx(forward, rel=1e-5)
+    # Steps go over the kinks of this set, which are not located: derivatives are as good as steps are
+    # short.
+    assert (float(end(0.8001)) - float(end(0.7999))) / 2e-4 == pytest.approx(forward, rel=1e-5)
