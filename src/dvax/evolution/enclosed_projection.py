@@ -24,9 +24,8 @@ from .. import _tree
 from .._tree import Tree
 from ..problem import Problem
 from ..programs.enclosure import LinearEnclosure, enclose, is_enclosure
-from ..sets import AbstractSet, ConstrainedBox, Polyhedron
-from ..sets._face import Face
-from ..sets._library import sets_in
+from ..sets import AbstractSet
+from ..sets._face import Face, iterates
 from ..spaces import AbstractSpace
 from .moving_set import Motion
 
@@ -75,9 +74,8 @@ def rounding_of(K: AbstractSet, space: AbstractSpace, *places: Any) -> jax.Array
         for at in places
     ]
     size = jnp.max(jnp.stack([v.astype(_tree.dtype(places[0].z)) for v in sizes]))
-    is_iterated = any(isinstance(s, Polyhedron | ConstrainedBox) for s in sets_in(K))
     eps = float(jnp.finfo(size.dtype).eps)
-    return (_ROWS * eps**_ITERATED if is_iterated else _ROUNDINGS * eps) * size
+    return (_ROWS * eps**_ITERATED if iterates(K) else _ROUNDINGS * eps) * size
 
 
 def gap(faces: tuple[Face, Face], scales: tuple[jax.Array, jax.Array]) -> jax.Array:

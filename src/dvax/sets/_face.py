@@ -54,6 +54,11 @@ def is_polyhedral(K: AbstractSet) -> bool:
     return is_of_library(K) and not any(isinstance(part, others) for part in sets_in(K))
 
 
+def iterates(K: AbstractSet) -> bool:
+    """Return whether a projection onto K iterates active rows, at least in one part."""
+    return any(isinstance(part, Polyhedron | ConstrainedBox) for part in sets_in(K))
+
+
 def face(K: AbstractSet, z: Tree, space: AbstractSpace) -> Face | None:
     """Return the face of K at the projection of z, or None for a set without a rule here."""
     bounds = K.intervals(z)

@@ -25,8 +25,9 @@ def bound_error(
 
     **Arguments:** `problem` and `sol`, the solution of it; `constants`, its moduli; `initial_error`,
     a bound on ‖x_h(t0) − x(t0)‖, or the `Bound` of the run that this one continues from its last
-    saved state. (With M > 1 every piece multiplies the bound by M.) `max_steps`: without constants,
-    the bound is infinite from where its own run has taken more steps, and the time of the call with it.
+    saved state. (With M > 1 every piece multiplies the bound by M.) `max_steps`, without constants,
+    limits the steps of the run below, and so the time of the call: where they are used up the bound
+    becomes infinite.
 
     **Without constants** the bound is proved along the trajectory, in tubes around pieces of it, from
     the code of f and h: no region has to be given, and errors grow in the bound as those of the
@@ -87,7 +88,7 @@ def bound_error(
         return _checked(bound_by_constants(problem, sol, constants, initial_error), sol)
     problem = current(problem)
     check_bounded(problem, sol, initial_error)
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
         raise input_error(
             "dvax.bound_error(max_steps)", repr(max_steps), "it must be an integer ≥ 1",
             "Omit it for 5000000",

@@ -41,9 +41,7 @@ from ..evolution.solve import run_again
 from ..generators import AbstractGenerator, AbstractMatrixFree, Growth, Product
 from ..operators import AbstractOperator, Spectrum
 from ..problem import Problem
-from ..sets import ConstrainedBox, Polyhedron
-from ..sets._face import face
-from ..sets._library import sets_in
+from ..sets._face import face, iterates
 from .constants import Constants
 from .domain import Domain
 from .error_ellipsoid import Disturbances
@@ -310,7 +308,7 @@ def _roundoff(
         rate = _tree.add(generator.apply(x), problem.f(t, x, u, args))
         K = problem.set_at(t, args)
         projected = jnp.zeros_like(control.norm(u))
-        if any(isinstance(part, Polyhedron | ConstrainedBox) for part in sets_in(K)):
+        if iterates(K):
             # Rows that are nearly parallel move y by many times their own roundoff.
             y = operator.apply(u)
             projected = rounding_of(K, control, Place(y, y, face(K, y, control)))

@@ -8,8 +8,7 @@ import jax.tree_util as jtu
 
 from .. import sets
 from ..sets._dual_active_set import SLACK
-from ..sets._face import face
-from ..sets._library import sets_in
+from ..sets._face import face, iterates
 from ..spaces import AbstractSpace
 
 
@@ -48,9 +47,7 @@ def rounding_of_w(
 def condition_at(K: sets.AbstractSet, y: Any, space: AbstractSpace) -> Any:
     """Return the factor by which roundoff in the rows that hold with equality at y moves a projection
     onto K, as far as it is known."""
-    if not any(isinstance(part, sets.Polyhedron | sets.ConstrainedBox) for part in sets_in(K)):
-        return 1.0
-    found = face(K, y, space)
+    found = face(K, y, space) if iterates(K) else None
     return 1.0 if found is None else found.condition
 
 
