@@ -61,12 +61,12 @@ class Solution(eqx.Module):
     - `law_residual`, `law_step`: ‖w‖ and ‖ȳ − y‖ of one projection step from y;
     - `defect`: ∫ ‖p − f̃(·, x_h)‖ ds up to each saved time. The computed trajectory x_h is the exact
       solution of the system with the disturbance p − f̃. `dvax.bound_error` computes error bounds from
-      it. None if it is not measured (fixed steps without `measure=True`);
+      it. None if it is not measured (fixed steps and `PiecewiseLinear` without `measure=True`);
     - `law_defect`: the integral of ‖w‖ over the frozen solves, or of a bound on ‖w‖ for the line
       between the responses at the ends of each step, or None;
     - `completed_defect`: (defect, law_defect) at the start of the step that contains each saved time;
     - `bounds`: bounds on x_h and u_h since the saved time before, or t0, to the end of that step, if
-      `constants=` hold in a region only, else None; of `Picard` and `PiecewiseLinear` since t0;
+      `constants=` hold in a region only, else None; of `Picard` since t0;
     - `enclosed`: True if the defect and `bounds` are enclosures over every step
       (`dvax.programs.enclosure`), False if samples estimate them;
     - `stats`: the `method`, with the reason where it was chosen; the numbers of accepted `steps`, of

@@ -115,8 +115,8 @@ def solve(
       limits it.
       Constants of a region hold while x and u stay in it. This is checked at 256 more times;
       between them you must check it yourself;
-    - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps only
-      when asked, since it doubles their cost;
+    - `measure`: whether to sample the defect inside steps. Adaptive steps always do; fixed steps, and
+      `PiecewiseLinear`, only when asked or with `constants`, since it doubles their cost;
     - `dense`: keep every step, for `Solution.evaluate`. Under `jax.jit` there is room for `max_steps`
       of them, and else for as many as the run needs;
     - `dt0`, `horizon`: first step and length of the whole run, to continue a run in pieces. Without
@@ -305,7 +305,11 @@ def arranged(call: Arguments, method: Any) -> tuple[Setup, Options]:
         "horizon": span if call.horizon is None else _number(call.horizon),
         "stiff_steps": math.inf,
     }
-    measured = not isinstance(method, Implicit) and (bool(call.measure) or not fixed)
+    if isinstance(method, PiecewiseLinear):
+        # Its steps do not need their defect, which costs as much as they do.
+        measured = bool(call.measure) or call.constants is not None
+    else:
+        measured = not isinstance(method, Implicit) and (bool(call.measure) or not fixed)
     options = Options(
         fixed=fixed,
         measure=measured,

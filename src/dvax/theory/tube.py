@@ -15,7 +15,7 @@ import numpy as np
 from .. import _tree
 from .._tree import Tree
 from ..errors import input_error
-from ..evolution import ETD2RK, RESULTS, Solution, solve
+from ..evolution import ETD2RK, RESULTS, PiecewiseLinear, Solution, solve
 from ..evolution.arguments import ADAPTIVE_STEPS
 from ..evolution.results import is_success
 from ..problem import Problem
@@ -120,6 +120,7 @@ class Tube:
         # A piece may have a part of all steps, so that there are some for a larger tolerance.
         self.max_steps = min(max(max_steps // 4, 1), ADAPTIVE_STEPS)
         self.problem, self.args, self.x0 = problem, setup.args, setup.x0
+        self.by_modes = isinstance(setup.method, PiecewiseLinear)
         self.span = end - t0
         # A tube is narrow: to cut it would gain little.
         self.system = System(problem, setup.x0, setup.args, max_cuts=0)
@@ -268,7 +269,16 @@ class Tube:
         x, step = self.x0, None
         if before is not None:
             x = jtu.tree_map(lambda rows: rows[-1], before.sol.xs)
-            step = min(float(before.sol.stats["next_dt"]), nodes[-1] - a)
+            step = min(float(before.sol.stats["next_dt"]), nodes[-1] - a) if not self.by_modes else None
+        if self.by_modes:
+            found = solve(
+                self.problem, x, a, nodes[-1], self.args, times, rtol=1e-8, atol=1e-10,
+                method=PiecewiseLinear(), constants=self.first, max_steps=self.max_steps, throw=False,
+                horizon=self.span,
+            )
+            self.latest_steps = int(found.stats["steps"])
+            self.is_stopped = bool(found.result == RESULTS.max_steps)
+            return found
         found = solve(
             self.problem, x, a, nodes[-1], self.args, times,
             rtol=self.looseness * self.rtol, atol=self.looseness * self.atol,
@@ -349,7 +359,7 @@ class Tube:
         needed, or not in a few intervals only."""
         shares, ts = along.found.shares, np.asarray(along.sol.ts, float)
         ends = ts[along.ends]
-        room = min(_MORE, int(along.sol.stats["steps"]) // _STEPS)
+        room = min(_MORE, int(along.sol.stats["steps"]) // _STEPS) if not self.by_modes else _MORE
         (large,) = np.nonzero(shares > 0.05 * along.found.share)
         part = float(shares[large].sum())
         is_small = along.found.share <= share_limit(ends[-1] - along.start, self.span)
@@ -372,7 +382,7 @@ class Tube:
         start, ts = float(sol.setup.setting["t0"]), np.asarray(sol.ts, float)
         last = len(ts) - 1
         if nodes is None:
-            count = min(self.intervals, int(sol.stats["steps"]) // _STEPS)
+            count = min(self.intervals, int(sol.stats["steps"]) // _STEPS) if not self.by_modes else self.intervals
             nodes = np.linspace(start, ts[-1], max(count, 1) + 1)[1:]
         inner = np.unique(np.searchsorted(ts, nodes[:-1]))
         ends = [*(int(k) for k in inner[ts[inner] < ts[-1]]), last]

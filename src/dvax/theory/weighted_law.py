@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._jax.jaxprs import ClosedJaxpr, Literal, bind, read
+from .._jax.jaxprs import ClosedJaxpr, Literal
 from ..problem import Problem
+from ..programs.intermediate import intermediate, maker, subtracted
 from .system import System
 
 
@@ -41,7 +42,7 @@ def splits(system: System) -> list[Split]:
 
 
 def _split(system: System, traced: ClosedJaxpr, a: Any, G: Any) -> Split:
-    weight, rest = _output(traced, a), _output(traced, G)
+    weight, rest = intermediate(traced, a), intermediate(traced, G)
 
     def number(t: Any, x: Any, u: Any) -> jax.Array:
         return weight(t, x, u).reshape(())
@@ -54,47 +55,19 @@ def _split(system: System, traced: ClosedJaxpr, a: Any, G: Any) -> Split:
 
 def _factors(traced: ClosedJaxpr, shape: tuple[int, ...]) -> list[tuple[Any, Any]]:
     """The variables that hold a and G; of two numbers either may be a."""
-    jaxpr = traced.jaxpr
-    made = {out: eqn for eqn in jaxpr.eqns for out in eqn.outvars}
-    last = _maker(made, jaxpr.outvars[0])
-    if last is None or last.primitive.name != "sub" or last.invars[0] is not jaxpr.invars[-1]:
-        return []
-    product = _maker(made, last.invars[1])
+    product = maker(traced, subtracted(traced))
     if product is None or product.primitive.name != "mul":
         return []
-    pairs = [(_single(made, a), G) for a, G in (product.invars, product.invars[::-1])]
+    pairs = [(_single(traced, a), G) for a, G in (product.invars, product.invars[::-1])]
     return [(a, G) for a, G in pairs if a is not None and G.aval.shape == shape]
 
 
-def _maker(made: dict[Any, Any], atom: Any) -> Any | None:
-    return None if isinstance(atom, Literal) else made.get(atom)
-
-
-def _single(made: dict[Any, Any], atom: Any) -> Any | None:
+def _single(traced: ClosedJaxpr, atom: Any) -> Any | None:
     """The one number that `atom` repeats."""
     while True:
         if isinstance(atom, Literal) or math.prod(atom.aval.shape) == 1:
             return atom
-        eqn = _maker(made, atom)
+        eqn = maker(traced, atom)
         if eqn is None or eqn.primitive.name not in ("broadcast_in_dim", "reshape"):
             return None
         atom = eqn.invars[0]
-
-
-def _output(traced: ClosedJaxpr, atom: Any) -> Callable[..., jax.Array]:
-    """Return a function that computes an intermediate value of a program instead of its output."""
-    if isinstance(atom, Literal):
-        return lambda *inputs: jnp.asarray(atom.val)
-    jaxpr = traced.jaxpr
-
-    def fn(*inputs: Any) -> jax.Array:
-        environment = dict(zip(jaxpr.constvars, traced.consts, strict=True))
-        environment.update(zip(jaxpr.invars, jtu.tree_leaves(inputs), strict=True))
-        for eqn in jaxpr.eqns:
-            if atom in environment:
-                break
-            results = bind(eqn, read(environment, eqn.invars))
-            environment.update(zip(eqn.outvars, results, strict=True))
-        return jnp.asarray(environment[atom])
-
-    return fn

@@ -41,6 +41,10 @@ class Piece(NamedTuple):
     noise: Array
     error: Array
 
+    def uncertainty(self) -> Array:
+        """Return the error of (g, q), that of the evaluation included."""
+        return self.error + self.noise + _EVALUATION * np.abs(self.coefficients).sum(axis=0)
+
     def evaluate(self, positions: Array) -> Array:
         """Return (g, q), one row per relative position in [0, 1]."""
         if len(self.coefficients) == 1:
@@ -48,11 +52,11 @@ class Piece(NamedTuple):
         s = 2.0 * np.asarray(positions) - 1.0
         return np.polynomial.chebyshev.chebval(s, self.coefficients).T
 
-    def local(self, begin: float, length: float) -> Array:
+    def local(self, begin: float, length: float, chop: bool = True) -> Array:
         """Return the Chebyshev coefficients of the polynomial on [begin, begin + length] of the piece.
 
-        Coefficients below the roundoff level are dropped: on a short interval all coefficients of high
-        degree are rounding errors.
+        Coefficients below the roundoff level are dropped if `chop`: on a short interval all
+        coefficients of high degree are rounding errors.
         """
         c = self.coefficients
         s, ratio = 2.0 * (begin + 0.5 * length) / self.length - 1.0, length / self.length
@@ -60,6 +64,8 @@ class Piece(NamedTuple):
             return np.stack([c[0] + s * c[1], ratio * c[1]]) if len(c) == 2 else c
         values = np.polynomial.chebyshev.chebval(s + ratio * _POINTS, c).T
         new = _TO_COEFFICIENTS @ values
+        if not chop:
+            return new
         significant = np.abs(new) > _CHOP_TOLERANCE * np.abs(c).sum(axis=0)
         degree = int(np.flatnonzero(significant.any(axis=1)).max(initial=1))
         keep = np.where(np.arange(degree + 1)[:, None] < 2, 1.0, significant[: degree + 1])
@@ -75,6 +81,9 @@ def basis(positions: Array) -> Array:
     """Return the Chebyshev polynomials at positions in [0, 1]: a row per point, a column per degree."""
     return np.polynomial.chebyshev.chebvander(2.0 * positions - 1.0, STAGES)
 
+
+_EVALUATION = 32.0 * np.finfo(float).eps
+"""Rounding error of a value, relative to the sum of the absolute values of the coefficients."""
 
 _CHOP_TOLERANCE = 16.0 * np.finfo(float).eps
 

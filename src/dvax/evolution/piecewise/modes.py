@@ -70,7 +70,8 @@ class Equations:
     """The equations of one mode.
 
     - `unknown`: a mask of the unknown entries of p;
-    - `prescribed_p`, `prescribed_d`: the prescribed values, 0 elsewhere;
+    - `prescribed_p`, `prescribed_d`: the prescribed values, 0 elsewhere; `prescribed_y`: those of y,
+      NaN elsewhere;
     - `conditions`: the inequalities that must hold in this mode;
     - `scales`: the time scales of the mode, about 1/|λ|, in increasing order.
     """
@@ -82,6 +83,7 @@ class Equations:
         self.unknown = free != system.swapped
         u = self.unknown
         y = np.where(state < 0, system.low, np.where(state > 0, system.up, 0.0))
+        self.prescribed_y = np.where(free, np.nan, y)
         value = np.where(free, 0.0, y)
         self.prescribed_p = np.where(u, 0.0, value)
         self.prescribed_d = np.where(u, value, 0.0)

@@ -21,6 +21,7 @@ from ..responses import Responses
 from ..results import RESULTS
 from ..setup import Options, Setup
 from ..solution import Solution
+from .defect import Norms
 from .inputs import Piece, UnresolvedInput, build_pieces
 from .records import Row
 from .run import Run
@@ -32,7 +33,7 @@ Array = np.ndarray
 
 def propagate(setup: Setup, ts: Any, options: Options) -> Solution:
     """Return the solution, up to the last saved time that was reached if the run fails. Of the options
-    it uses `max_steps` (accepted and rejected ones), `dense`, `track_bounds` and `progress`.
+    it uses `max_steps` (accepted and rejected ones), `measure`, `dense`, `track_bounds` and `progress`.
 
     **Raises:** `dvax.InputError` if the problem is not piecewise affine; `dvax.DifferentiationError`
     under `jax.jit`, `jax.grad` and `jax.vmap`.
@@ -58,8 +59,8 @@ def propagate(setup: Setup, ts: Any, options: Options) -> Solution:
         pieces = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
         unresolved = error
     run = Run(
-        system, data.pivoted, pieces, np.asarray(x0, float).ravel(), data.weights, (rtol, atol), times,
-        options,
+        system, data.pivoted, pieces, np.asarray(x0, float).ravel(), data.norms, (rtol, atol), times,
+        options, float(jnp.finfo(x0.dtype).eps),
     )  # fmt: skip
     setup_end = time.perf_counter()
     if unresolved is None:
@@ -76,15 +77,15 @@ def propagate(setup: Setup, ts: Any, options: Options) -> Solution:
 
 
 class _Data(NamedTuple):
-    """What a run needs of a problem, and the arguments that it belongs to; `weights`: the norms of the
-    unit vectors of the state space."""
+    """What a run needs of a problem, and the arguments that it belongs to; `norms`: those of the
+    unit vectors of both spaces."""
 
     like: tuple[Any, ...]
     args: Any
     knots: Knots
     system: Affine
     pivoted: Affine
-    weights: Array
+    norms: Norms
 
     def serves(self, x0: jax.Array, args: Any) -> bool:
         """Return whether a run from x0 with these args has the same data."""
@@ -101,12 +102,17 @@ def _data(problem: Problem, t0: float, x0: jax.Array, args: Any) -> _Data:
     if not (cache and cache[0].serves(x0, args)):
         problem.check(t0, x0, args)
         knots, system = problem.data_knots(t0, x0, args), affine(problem, t0, x0, args)
-        units = jnp.eye(x0.size).reshape(-1, *x0.shape)
-        weights = np.asarray(_norms(problem.spaces(x0)[0], units))
+        likes = x0, problem.zero_control(x0)
+        norms = Norms(
+            *(
+                np.asarray(_norms(space, jnp.eye(v.size, dtype=v.dtype).reshape(-1, *v.shape)), float)
+                for space, v in zip(problem.spaces(x0), likes, strict=True)
+            )
+        )
         like = x0.shape, x0.dtype
         # A copy: an array of NumPy may be changed before the next run.
         args = jtu.tree_map(lambda v: np.array(v) if isinstance(v, np.ndarray) else v, args)
-        cache[:] = [_Data(like, args, knots, system, pivoted(system), weights)]
+        cache[:] = [_Data(like, args, knots, system, pivoted(system), norms)]
     return cache[0]
 
 
@@ -151,9 +157,13 @@ def _solution(
         ts=array([r.t for r in rows], ()),
         xs=array([r.x for r in rows], x0.shape),
         law=Responses(_inverses(P, y) if rows else y, y, residual, step, error),
-        defect=array(defects[:, 0], ()),
-        law_defect=array(defects[:, 1], ()),
-        completed_defect=(array(completed_defect[:, 0], ()), array(completed_defect[:, 1], ())),
+        defect=array(defects[:, 0], ()) if options.measure else None,
+        law_defect=array(defects[:, 1], ()) if options.measure else None,
+        completed_defect=(
+            (array(completed_defect[:, 0], ()), array(completed_defect[:, 1], ()))
+            if options.measure
+            else None
+        ),
         bounds=_bounds(rows, n, x0, u0, P) if options.track_bounds and rows else None,
         stats={
             "steps": run.accepted, "rejected": run.rejected,

@@ -114,12 +114,16 @@ _MARGIN = 1.0 / np.cos(0.5 * np.pi / _GRID_DENSITY) - 1.0
 """max |p| on [0, 1] ≤ (1 + _MARGIN) max |p| on the grid, up to degree STAGES (Ehlich and Zeller
 1964)."""
 
-_EXTREMES = _lobatto(STAGES)
-COEFFICIENTS = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * _EXTREMES - 1, STAGES))
-TAIL_OF_STATE = (COEFFICIENTS @ interpolation(NODES, _EXTREMES))[-2:]
+EXTREMES = _lobatto(STAGES)
+"""The points at which Chebyshev coefficients are computed."""
+
+COEFFICIENTS = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * EXTREMES - 1, STAGES))
+"""Maps values at `EXTREMES` to Chebyshev coefficients."""
+
+TAIL_OF_STATE = (COEFFICIENTS @ interpolation(NODES, EXTREMES))[-2:]
 """Maps a state at the nodes to its last two Chebyshev coefficients."""
 
-TAIL_OF_MULTIPLIER = (COEFFICIENTS @ interpolation(POINTS, _EXTREMES))[-3:-1]
+TAIL_OF_MULTIPLIER = (COEFFICIENTS @ interpolation(POINTS, EXTREMES))[-3:-1]
 """Maps a multiplier at the collocation points to its last two Chebyshev coefficients."""
 
 _RHO = np.abs(np.prod(np.linspace(0, 1, 4001)[:, None] - POINTS, axis=1))
@@ -140,7 +144,7 @@ class Wave(NamedTuple):
     amplitude: complex
 
 
-class _Sum:
+class Sum:
     """The sum of a polynomial, given by its values on the grid, and of waves."""
 
     def __init__(self, values: Array, waves: Sequence[Wave]):
@@ -189,7 +193,7 @@ def first_negative(
 
     Branch and bound: discard an interval if the bounds decide its sign, bisect it otherwise.
     """
-    function = _Sum(values, waves)
+    function = Sum(values, waves)
     if function(0.0) < -slack:
         return 0.0, True
     a, b, negative = np.zeros(1), np.full(1, until), False

@@ -13,9 +13,9 @@ import math
 import numpy as np
 
 from .. import meter
-from ..defect import ROUNDINGS
 from ..setup import Options
 from . import radau
+from .defect import Norms, Polynomials, step_defect
 from .inputs import Piece, basis, is_continuous, values
 from .lengths import length_past, lengthen, shorten, two_sum
 from .modes import Condition, Equations, Mode, initial_mode, mode_after
@@ -31,16 +31,17 @@ class Run:
     """The state of a run from x0 over the pieces of the inputs.
 
     The pieces belong to the `original` system; steps use the variables of the `pivoted` system.
-    `weights` are the norms of the unit vectors of the state space. With `tol` = (rtol, atol), the
-    error of the polynomials is at most 10⁻⁴ of this tolerance.
+    With `tol` = (rtol, atol), the error of the polynomials is at most 10⁻⁴ of this tolerance. `eps` is
+    the rounding error of a saved row.
     """
 
     def __init__(
-        self, original: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, weights: Array,
-        tol: tuple[float, float], times: Array, options: Options,
+        self, original: Affine, pivoted: Affine, pieces: list[Piece], x0: Array, norms: Norms,
+        tol: tuple[float, float], times: Array, options: Options, eps: float,
     ):  # fmt: skip
         self.original, self.system, self.pieces, self.x = original, pivoted, pieces, x0
-        self.weights, self.max_steps = weights, options.max_steps
+        self.norms, self.weights, self.max_steps = norms, norms.x, options.max_steps
+        self.eps, self.measure = eps, options.measure
         rtol, atol = tol
         self.tol, self.min_allowed = float(np.clip(1e-4 * rtol, 1e-12, 1e-6)), 1e-4 * atol
         self.rtol, self.atol, self.masked_error = rtol, atol, 0.0 * x0
@@ -60,9 +61,14 @@ class Run:
         self.t, self.result = pieces[0].start, "successful"
         self.began, self.printed_share = meter.now() if options.progress else None, 0.0
         self.span = pieces[-1].start + pieces[-1].length - self.t
-        m = len(original.low)
-        none = np.stack([np.full(m, np.inf), np.full(m, -np.inf)])
-        self.bounds = np.hstack([np.stack([x0, x0]), none]) if options.track_bounds else None
+        self.track_bounds = options.track_bounds
+        # Bounds on (x, y) since the last saved time.
+        self.bounds = self._no_bounds()
+
+    def _no_bounds(self) -> Array:
+        """Return the bounds (low, high) of nothing."""
+        size = len(self.x) + len(self.original.low)
+        return np.stack([np.full(size, np.inf), np.full(size, -np.inf)])
 
     def advance(self) -> None:
         """Advance to the end of the run, or to a failure, which `result` then names."""
@@ -143,7 +149,7 @@ class Run:
                     h, last_ratio = shorter_length, np.inf
                 else:
                     accepted = attempt
-            self._add_masked(masked, theta * h)
+            self.masked_error = self.masked_error + masked.state_error
             is_full = condition is None and theta == 1.0 and bool(h == remaining)
             end = piece.length if is_full else begin + (low + theta * h)
             self._accept(
@@ -200,7 +206,7 @@ class Run:
             masked = masked_violation(self.equations_of, self.original, equations, attempt, 1.0, h)
             if attempt.error_ratio <= 1.0 and self._is_negligible(masked, attempt):
                 self._switch(mode)
-                self._add_masked(masked, h)
+                self.masked_error = self.masked_error + masked.state_error
                 self._accept(attempt, h, 1.0, piece, begin, low, begin + (low + h), False)
                 begin, low = two_sum(begin, low + h)
                 self.crossing, self.switches_here = Crossing(begin + low, h), 0
@@ -319,13 +325,6 @@ class Run:
         remaining = np.maximum(allowed - self.masked_error, 0.0)
         return bool(np.all(masked.state_error <= _MASKED_SHARE * remaining))
 
-    def _add_masked(self, masked: MaskedViolation, length: float) -> None:
-        """Add the masked violations of a step of this length to the defects."""
-        of_y, of_w = masked.violation
-        self.defect += length * self._norm(np.abs(self.original.B) @ of_y)
-        self.law_defect += length * float(np.linalg.norm(of_w))
-        self.masked_error = self.masked_error + masked.state_error
-
     def _accept(
         self, attempt: Attempt, h: float, theta: float, piece: Piece, begin: float, low: float,
         end: float, last: bool,
@@ -337,18 +336,23 @@ class Run:
             begin + low,
         )
         completed_defect = self.defect, self.law_defect
-        state_residual, law_residual = attempt.residuals
-        n, part = len(self.x), step.length * step.used
-        mean = radau.mean_residual(step.used)
-        error = self.piece.error
-        self.defect += part * (mean * self._norm(state_residual) + self._norm(error[:n]))
-        self.law_defect += part * float(
-            mean * np.linalg.norm(law_residual) + np.linalg.norm(error[n:])
-        )
+        n, of_row, part = len(self.x), 0.0, None
+        after = step.evaluate(np.array([theta]))[0][0]
         self.accepted += 1
+        if step.used > 0.0 and (self.measure or self.track_bounds):
+            inputs = self.piece
+            equations = self.equations_of(self.mode)
+            part = Polynomials.of(
+                attempt.x, attempt.ys, oscillations, theta, h, inputs, begin, equations.prescribed_y,
+            )  # fmt: skip
+            found = step_defect(
+                self.original, equations, self.norms, part, self.x, after,
+                inputs.uncertainty(),
+            )  # fmt: skip
+            self.defect, self.law_defect = self.defect + found.state, self.law_defect + found.law
+            of_row = found.of_row + self.eps * self._norm(part.size())
         if step.used > 0.0:
             size, of_y, of_w = attempt.sizes(step.used)
-            self.defect += ROUNDINGS * np.finfo(float).eps * self._norm(size)
             self.largest = np.maximum(self.largest, [of_y, of_w])
             # The error is zero at the start of the step; Markov's inequality bounds its growth.
             self.truncation = min(1.0, _MARKOV * step.used) * attempt.truncation
@@ -357,32 +361,47 @@ class Run:
         share = (self.t - self.pieces[0].start) / self.span
         if self.printed_share + _PROGRESS_INTERVAL < share < 1.0:
             self._print_progress(share)
-        if self.bounds is not None:
-            self.bounds = attempt.widen(self.bounds)
-        total_defect, first = (self.defect, self.law_defect), len(self.rows)
+        first = len(self.rows)
         offsets = self.times[first:] - piece.start
         # The last step includes saved times that rounding puts after its end.
         offsets = offsets if last else offsets[: np.searchsorted(offsets, end)]
+        thetas = np.clip((offsets - begin) / step.length, 0.0, step.used)
+        bounds = self._bounds_at(part, step, thetas)
         if len(offsets):
-            thetas = np.clip((offsets - begin) / step.length, 0.0, step.used)
             x, y = step.evaluate(thetas)
             q = self.piece.evaluate((begin + thetas * step.length) / piece.length)[:, n:]
             w = y @ self.original.M.T + x @ self.original.C.T + q
             self.rows += [
                 Row(
-                    float(self.times[first + k]),
-                    x[k],
-                    y[k],
-                    w[k],
-                    total_defect,
-                    completed_defect,
-                    self.bounds,
+                    float(self.times[first + k]), x[k], y[k], w[k],
+                    (self.defect + of_row, self.law_defect), completed_defect,
+                    None if bounds is None else bounds[k],
                 )
                 for k in range(len(offsets))
-            ]
+            ]  # fmt: skip
         if self.dense:
             self.steps.append(step)
-        self.x = step.evaluate(np.array([theta]))[0][0]
+        self.x = after
+
+    def _bounds_at(
+        self, part: Polynomials | None, step: Step, thetas: Array
+    ) -> list[Array] | None:
+        """Return bounds on (x, y) from each of these θ of a step back to the last saved time, if bounds
+        are tracked. The step has a `part` unless its length is zero."""
+        if not self.track_bounds:
+            return None
+        if part is None:
+            at = np.concatenate(step.evaluate(np.zeros(1)), axis=1)[0]
+            boxes = np.broadcast_to(at, (len(thetas) + 1, 2, len(at)))
+        else:
+            boxes = part.boxes(np.concatenate([[0.0], thetas / step.used, [1.0]]))
+        found = []
+        for box in boxes:
+            low, high = np.minimum(self.bounds[0], box[0]), np.maximum(self.bounds[1], box[1])
+            found.append(np.stack([low, high]))
+            self.bounds = self._no_bounds()
+        self.bounds = found.pop()
+        return found
 
     def _norm(self, v: Array) -> float:
         """Return an upper bound of the norm of the state space, exact for orthogonal unit vectors."""

@@ -21,6 +21,7 @@ import numpy as np
 from ..._tree import Tree
 from ...errors import Problems, input_error
 from ...problem import Problem
+from ...programs.intermediate import intermediate, subtracted
 from ...vi import analyse, independent
 
 Array = np.ndarray
@@ -29,11 +30,21 @@ LARGEST = 64
 """Largest number of states and of responses: a step solves dense equations in all of them."""
 
 
+class Sizes(NamedTuple):
+    """Sums of the absolute values of the terms of the matrices of a system, for rounding errors."""
+
+    A: Array
+    B: Array
+    M: Array
+    C: Array
+
+
 class Affine(NamedTuple):
     """The matrices of a system and the bounds `low` ≤ y ≤ `up`.
 
     - `swapped`: a mask of the pairs whose independent member is w;
-    - `inputs`: the matrix that maps (g, q) of the problem to (g, q) in these variables.
+    - `inputs`: the matrix that maps (g, q) of the problem to (g, q) in these variables;
+    - `sizes`: those of the terms of A, B, M and C before pivots.
     """
 
     A: Array
@@ -44,6 +55,7 @@ class Affine(NamedTuple):
     up: Array
     swapped: Array
     inputs: Array
+    sizes: Sizes
 
     def pivot(self, i: int) -> "Affine":
         """Return the system with the members of pair i exchanged (a principal pivot)."""
@@ -75,9 +87,9 @@ def affine(problem: Problem, t0: Any, x0: Tree, args: Any) -> Affine:
     u0 = problem.zero_control(x0)
     _check(problem, t0, x0, u0, args)
     matrices = _matrices(problem, args, x0, u0, jnp.asarray(t0, jnp.result_type(x0)))
-    A, B, M, C, low, up = (np.asarray(v, float) for v in matrices)
+    A, B, M, C, low, up, *sizes = (np.asarray(v, float) for v in matrices)
     n, m = B.shape
-    return Affine(A, B, M, C, low, up, np.zeros(m, bool), np.eye(n + m))
+    return Affine(A, B, M, C, low, up, np.zeros(m, bool), np.eye(n + m), Sizes(*sizes))
 
 
 def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
@@ -125,11 +137,19 @@ def _matrices(problem: Problem, args: Any, x0: Any, u0: Any, t: Any) -> tuple[An
         return jax.jacfwd(at, argnums=(0, 1))(x0.ravel(), u0.ravel())
 
     (f_x, f_u), (h_x, h_u) = slopes(problem.f), slopes(problem.h)
+    law, size = inverse - h_u @ inverse, jnp.abs(inverse) + jnp.abs(h_u) @ jnp.abs(inverse)
+    traced = jax.make_jaxpr(lambda t, x, u: problem.h(t, x, u, args))(t, x0, u0)
+    rest = subtracted(traced)
+    if rest is not None:
+        # u does not cancel to a small M, which would have the rounding errors of 1.
+        of_rest = slopes(lambda t, x, u, args: intermediate(traced, rest)(t, x, u))[1]
+        law, size = of_rest @ inverse, jnp.abs(of_rest) @ jnp.abs(inverse)
     bounds = problem.set_at(t, args).intervals(u0)
     assert bounds is not None
     low, up = (v.ravel() for v in bounds)
     # Terms of f that cancel terms of the generator do so here, before the time integration.
-    return linear + f_x, f_u @ inverse, inverse - h_u @ inverse, -h_x, low, up
+    sizes = jnp.abs(linear) + jnp.abs(f_x), jnp.abs(f_u) @ jnp.abs(inverse), size, jnp.abs(h_x)
+    return linear + f_x, f_u @ inverse, law, -h_x, low, up, *sizes
 
 
 def pivoted(system: Affine) -> Affine:
