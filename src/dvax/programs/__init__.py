@@ -6,7 +6,7 @@ lists the tables.
 
 from collections.abc import Mapping
 
-from . import branches, enclosure, matrix, rounding, slope, structure, switching_times
+from . import analytic, branches, enclosure, matrix, rounding, slope, structure, switching_times
 from .interpreter import Rule
 
 DOMAINS: dict[str, Mapping[str, Rule]] = {
@@ -17,5 +17,6 @@ DOMAINS: dict[str, Mapping[str, Rule]] = {
     "rounding": rounding.RULES,
     "branches": branches.RULES,
     "switching times": switching_times.RULES,
+    "analytic": analytic.RULES,
 }
 """The rules of every domain, by the name of the operation."""

@@ -56,10 +56,10 @@ class _UnknownOperation(Exception):
 
 def complex_radius(
     fn: Callable[[Any], Any], low: Any, high: Any, reach: Any
-) -> tuple[jax.Array, bool]:
+) -> jax.Array:
     """Return a bound on |f(t) − c| for a complex number c and all complex t within `reach` of the middle
     of the real interval [low, high], entry by entry of the flat output; infinite where f is not proved
-    to be analytic there. The second result says whether every operation has a rule."""
+    to be analytic there."""
     time = jnp.asarray(low)
     program, shape = jax.make_jaxpr(fn, return_shape=True)(time)
     middle = 0.5 * (low + high)
@@ -68,14 +68,9 @@ def complex_radius(
         found = interpret(program, [t], _DOMAIN)
     except _UnknownOperation:
         sizes = [int(np.prod(leaf.shape)) for leaf in jtu.tree_leaves(shape)]
-        return jnp.full(sum(sizes), jnp.inf), False
-    rows = [
-        _lifted(v, jnp.result_type(low)).reach.ravel() if not isinstance(v, Decided)
-        else jnp.where(v.known, 0.0, jnp.inf) * jnp.ones(np.size(v.value))
-        for v in found
-    ]  # fmt: skip
-    radius = jnp.concatenate(rows)
-    return jnp.where(jnp.isnan(radius), jnp.inf, radius), True
+        return jnp.full(sum(sizes), jnp.inf, time.dtype)
+    radius = jnp.concatenate([_lifted(v, time.dtype).reach.ravel() for v in found])
+    return jnp.where(jnp.isnan(radius), jnp.inf, radius)
 
 
 def _unknown(eqn: Any, operands: list[Any]) -> list[Any]:
@@ -414,6 +409,7 @@ def _table(degree: int) -> Rule:
             isinstance(v, Analytic | Decided) for v in (times, values, *slopes)
         ):
             return _unknown(eqn, operands)
+        times, values, *slopes = map(jnp.asarray, (times, values, *slopes))
         last = len(times) - 2
         place = lambda s: jnp.searchsorted(times, s, side="right") - 1  # noqa: E731
         first, other = place(t.low), place(t.high)

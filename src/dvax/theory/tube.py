@@ -3,9 +3,13 @@
 On a piece [a, b] the enclosures of constants and of the slopes of derivatives hold in one box. The
 linearisation has a matrix for each of many intervals of time, which are made shorter where its rest is
 large: where the law passes a kink, and its derivative is unknown while it may be on either side.
+
+x_c is computed by `ETD2RK`, whose steps have an enclosed defect, or, for a small system that is affine
+while no constraint changes, by `PiecewiseLinear`, whose defect is of the size of rounding errors, however
+stiff the system is.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +21,7 @@ from .._tree import Tree
 from ..errors import input_error
 from ..evolution import ETD2RK, RESULTS, PiecewiseLinear, Solution, solve
 from ..evolution.arguments import ADAPTIVE_STEPS
+from ..evolution.piecewise.system import is_affine
 from ..evolution.results import is_success
 from ..problem import Problem
 from ..programs.slope import Values, interval
@@ -59,6 +64,12 @@ _FIRST_RADII = (0.1, 1e-2, 1e-3, 1e-4)
 
 _WIDENINGS = 4
 """Number of widths of a tube that are tried."""
+
+_MAX_BY_MODES = 16
+"""Largest number of unknowns of x and u together for which `PiecewiseLinear` replaces another method."""
+
+_RTOL_BY_MODES = 1e-8
+"""Smallest rtol for `PiecewiseLinear`."""
 
 _SHARPER, _LOOSEST, _TIGHTEST = 0.01, 1e-5, 1e-9
 """Tolerance of x_c relative to that of the solution, and its limits."""
@@ -120,7 +131,6 @@ class Tube:
         # A piece may have a part of all steps, so that there are some for a larger tolerance.
         self.max_steps = min(max(max_steps // 4, 1), ADAPTIVE_STEPS)
         self.problem, self.args, self.x0 = problem, setup.args, setup.x0
-        self.by_modes = isinstance(setup.method, PiecewiseLinear)
         self.span = end - t0
         # A tube is narrow: to cut it would gain little.
         self.system = System(problem, setup.x0, setup.args, max_cuts=0)
@@ -142,6 +152,10 @@ class Tube:
         self.weights = of_space(self.system.state, setup.x0)
         self.weights_u = of_space(self.system.control, self.system.u0)
         self.size = sum(map(np.size, jtu.tree_leaves(setup.x0)))
+        unknowns = self.size + sum(map(np.size, jtu.tree_leaves(self.system.u0)))
+        self.by_modes = isinstance(setup.method, PiecewiseLinear) or (
+            unknowns <= _MAX_BY_MODES and is_affine(problem, t0, setup.x0, setup.args)
+        )
         # Factors of the tolerances of x_c, and of the smallest reach of a tube; and whether constants
         # need bounds of u.
         self.looseness, self.width, self.limits_u = 1.0, 1.0, False
@@ -212,6 +226,9 @@ class Tube:
         error = initial_error if before is None else float(before.x[-1])
         nodes = np.linspace(a, b, self.intervals + 1)[1:]
         sol = self._solve(a, nodes, saved, before)
+        if self.by_modes and not (bool(is_success(sol.result)) and sol.enclosed):
+            self.by_modes = False
+            return self.piece(a, b, saved, before, initial_error)
         if not bool(is_success(sol.result)):
             return f"ETD2RK, whose defect is enclosed, fails: {RESULTS[sol.result]}"
         assert sol.bounds is not None  # the constants are of a region
@@ -269,22 +286,15 @@ class Tube:
         x, step = self.x0, None
         if before is not None:
             x = jtu.tree_map(lambda rows: rows[-1], before.sol.xs)
-            step = min(float(before.sol.stats["next_dt"]), nodes[-1] - a) if not self.by_modes else None
+            step = min(float(before.sol.stats["next_dt"]), nodes[-1] - a)
+        rtol, atol = self.looseness * self.rtol, self.looseness * self.atol
+        own: dict[str, Any] = {"method": ETD2RK(), "dt0": step, "rtol": rtol}
         if self.by_modes:
-            found = solve(
-                self.problem, x, a, nodes[-1], self.args, times, rtol=1e-8, atol=1e-10,
-                method=PiecewiseLinear(), constants=self.first, max_steps=self.max_steps, throw=False,
-                horizon=self.span,
-            )
-            self.latest_steps = int(found.stats["steps"])
-            self.is_stopped = bool(found.result == RESULTS.max_steps)
-            return found
+            own = {"method": PiecewiseLinear(), "rtol": max(rtol, _RTOL_BY_MODES)}
         found = solve(
-            self.problem, x, a, nodes[-1], self.args, times,
-            rtol=self.looseness * self.rtol, atol=self.looseness * self.atol,
-            method=ETD2RK(), constants=self.first, dt0=step, horizon=self.span,
-            max_steps=self.max_steps, throw=False,
-        )  # fmt: skip
+            self.problem, x, a, nodes[-1], self.args, times, atol=atol, constants=self.first,
+            horizon=self.span, max_steps=self.max_steps, throw=False, **own,
+        )
         self.latest_steps = int(found.stats["steps"])
         self.is_stopped = bool(found.result == RESULTS.max_steps)
         return found
@@ -359,7 +369,7 @@ class Tube:
         needed, or not in a few intervals only."""
         shares, ts = along.found.shares, np.asarray(along.sol.ts, float)
         ends = ts[along.ends]
-        room = min(_MORE, int(along.sol.stats["steps"]) // _STEPS) if not self.by_modes else _MORE
+        room = min(_MORE, self._intervals_of(along.sol))
         (large,) = np.nonzero(shares > 0.05 * along.found.share)
         part = float(shares[large].sum())
         is_small = along.found.share <= share_limit(ends[-1] - along.start, self.span)
@@ -372,6 +382,11 @@ class Tube:
             nodes.append(np.linspace(begins[k], ends[k], cuts + 2)[1:-1])
         return np.unique(np.concatenate(nodes))
 
+    def _intervals_of(self, sol: Solution) -> int:
+        """Return into how many intervals x_c may be divided: steps whose defect is of the size of
+        rounding errors may be charged several times."""
+        return self.capacity if self.by_modes else int(sol.stats["steps"]) // _STEPS
+
     def _linearised(
         self, sol: Solution, nodes: Values, region: Region, of_x: float, of_u: float,
         L: float,
@@ -382,8 +397,8 @@ class Tube:
         start, ts = float(sol.setup.setting["t0"]), np.asarray(sol.ts, float)
         last = len(ts) - 1
         if nodes is None:
-            count = min(self.intervals, int(sol.stats["steps"]) // _STEPS) if not self.by_modes else self.intervals
-            nodes = np.linspace(start, ts[-1], max(count, 1) + 1)[1:]
+            count = max(min(self.intervals, self._intervals_of(sol)), 1)
+            nodes = np.linspace(start, ts[-1], count + 1)[1:]
         inner = np.unique(np.searchsorted(ts, nodes[:-1]))
         ends = [*(int(k) for k in inner[ts[inner] < ts[-1]]), last]
         if self.local.is_known and len(ends) > 1:

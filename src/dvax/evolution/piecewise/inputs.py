@@ -15,6 +15,7 @@ import numpy as np
 
 from ..._tree import Tree
 from ...problem import Problem
+from ...programs.analytic import complex_radius
 from .radau import STAGES
 
 Array = np.ndarray
@@ -32,7 +33,7 @@ class Piece(NamedTuple):
 
     - `coefficients`: Chebyshev coefficients, one row per degree;
     - `noise`: the uncertainty of each entry due to rounding of t and of the values;
-    - `error`: the largest error at the check points, an estimate and not a bound.
+    - `error`: a bound on the largest error if it `is_proved`, else the largest one at the check points.
     """
 
     start: float
@@ -40,6 +41,7 @@ class Piece(NamedTuple):
     coefficients: Array
     noise: Array
     error: Array
+    is_proved: bool = False
 
     def uncertainty(self) -> Array:
         """Return the error of (g, q), that of the evaluation included."""
@@ -102,17 +104,32 @@ class UnresolvedInput(Exception):
 
 @eqx.filter_jit
 def _samples(problem: Problem, args: Any, x: Tree, u: Tree, ts: Any) -> Any:
-    def one(t: Any) -> Any:
-        f, h = problem.f(t, x, u, args), problem.h(t, x, u, args)
-        return jnp.concatenate([f.ravel(), -h.ravel()])
+    return jax.vmap(lambda t: _inputs(problem, args, x, u, t))(ts)
 
-    return jax.vmap(one)(ts)
+
+@eqx.filter_jit
+def _radii(problem: Problem, args: Any, x: Tree, u: Tree, low: Any, high: Any) -> Any:
+    """Return bounds on (g, q), up to constants, in discs around intervals of t: one row per interval and
+    per ρ."""
+
+    def one(low: Any, high: Any, rho: Any) -> Any:
+        reach = 0.25 * (high - low) * (rho + 1.0 / rho)
+        return complex_radius(lambda t: _inputs(problem, args, x, u, t), low, high, reach)
+
+    rows = jax.vmap(one, in_axes=(None, None, 0))
+    return jax.vmap(rows, in_axes=(0, 0, None))(low, high, jnp.asarray(_ELLIPSES, low.dtype))
+
+
+def _inputs(problem: Problem, args: Any, x: Tree, u: Tree, t: Any) -> jax.Array:
+    f, h = problem.f(t, x, u, args), problem.h(t, x, u, args)
+    return jnp.concatenate([f.ravel(), -h.ravel()])
 
 
 def build_pieces(
-    problem: Problem, stops: Array, x0: Any, args: Any, max_pieces: int
+    problem: Problem, stops: Array, x0: Any, args: Any, max_pieces: int, prove: bool = False
 ) -> list[Piece]:
-    """Return pieces that approximate the inputs between the first and the last of `stops`.
+    """Return pieces that approximate the inputs between the first and the last of `stops`; bounds on
+    their errors are proved if `prove` and if the code of f and h shows that the inputs are analytic.
 
     **Raises:** `UnresolvedInput` where the inputs are not finite, where an interval of a few units of
     roundoff in t is still too long, or where more than `max_pieces` pieces are necessary.
@@ -124,8 +141,7 @@ def build_pieces(
     def sample(starts: Array, lengths: Array, positions: Array) -> Array:
         """Return the values at these positions in every interval: [interval, position, entry]."""
         ts = (starts[:, None] + lengths[:, None] * (0.5 + 0.5 * positions)).ravel()
-        # Pad the number of samples to a power of two, so that few shapes are compiled.
-        padded = np.pad(ts, (0, (1 << (len(ts) - 1).bit_length()) - len(ts)), mode="edge")
+        padded = _padded(ts)
         values = np.asarray(_samples(problem, args, x, u, jnp.asarray(padded, dtype)), float)
         values = values[: len(ts)].reshape(len(starts), len(positions), -1)
         bad = ~np.isfinite(values).all(axis=(1, 2))
@@ -179,7 +195,47 @@ def build_pieces(
         half = 0.5 * lengths
         starts = np.stack([starts, starts + half], axis=1).ravel()
         lengths = np.repeat(half, 2)
-    return _close_gaps(sorted(accepted, key=lambda piece: piece.start))
+    pieces = _close_gaps(sorted(accepted, key=lambda piece: piece.start))
+    if not prove:
+        return pieces
+    starts, lengths = (np.array([getattr(p, name) for p in pieces]) for name in ("start", "length"))
+    c = np.einsum("ij,kjl->kil", _TO_COEFFICIENTS, sample(starts, lengths, _POINTS))
+    # The inputs may have other values at the knots themselves, up to a few roundings of t.
+    edge = np.minimum(_EDGE * eps * (np.abs(starts) + lengths), 0.01 * lengths)
+    ends = (jnp.asarray(_padded(v), dtype) for v in (starts + edge, starts + lengths - edge))
+    radii = np.asarray(_radii(problem, args, x, u, *ends), float)[: len(pieces)]
+    bounds = np.min(_INTERPOLATION[:, None] * radii, axis=1)
+    return [
+        _proved(piece, of_interpolant, row, float(share))
+        for piece, of_interpolant, row, share in zip(pieces, bounds, c, edge / lengths, strict=True)
+    ]
+
+
+def _proved(piece: Piece, of_interpolant: Array, c: Array, edge: float) -> Piece:
+    """Return a piece with a proved error, if that of the polynomial with the coefficients c that
+    interpolates the inputs is finite; `edge`: the part of the piece next to each end of it that is not
+    examined."""
+    if not np.isfinite(of_interpolant).all():
+        return piece
+    apart = c.copy()
+    apart[: len(piece.coefficients)] -= piece.coefficients
+    size = np.abs(c).sum(axis=0)
+    error = of_interpolant + np.abs(apart).sum(axis=0) + 4.0 * edge * size
+    return piece._replace(error=error, is_proved=True)
+
+
+def _padded(values: Array) -> Array:
+    """Return values whose number is a power of two, the last one repeated: few shapes are compiled."""
+    return np.pad(values, (0, (1 << (len(values) - 1).bit_length()) - len(values)), mode="edge")
+
+
+_ELLIPSES = np.array([2.0, 3.0, 5.0, 8.0, 13.0, 21.0, 50.0])
+"""Values of ρ, the sum of the semiaxes of an ellipse in the complex plane, over half of an interval."""
+
+_INTERPOLATION = 4.0 * _ELLIPSES**-STAGES / (_ELLIPSES - 1.0)
+"""The error of interpolation in Chebyshev points, for a function of modulus ≤ 1 in each ellipse."""
+
+_EDGE = 64.0
 
 
 def _close_gaps(pieces: list[Piece]) -> list[Piece]:

@@ -54,7 +54,7 @@ def propagate(setup: Setup, ts: Any, options: Options) -> Solution:
     times = np.array([t1]) if ts is None else np.asarray(ts, float)
     unresolved = None
     try:
-        pieces = build_pieces(problem, stops, x0, args, options.max_steps)
+        pieces = build_pieces(problem, stops, x0, args, options.max_steps, options.measure)
     except UnresolvedInput as error:
         pieces = [Piece(t0, t1 - t0, np.zeros((1, 1)), np.zeros(1), np.zeros(1))]
         unresolved = error
@@ -73,7 +73,7 @@ def propagate(setup: Setup, ts: Any, options: Options) -> Solution:
         "compile_time": setup_end - setup_start,
         "run_time": time.perf_counter() - setup_end,
     }
-    return _solution(setup, x0, run, system, spaces, options, timing)
+    return _solution(setup, x0, run, system, spaces, options, timing, pieces)
 
 
 class _Data(NamedTuple):
@@ -128,7 +128,7 @@ def _inverses(operator: AbstractOperator, rows: jax.Array) -> jax.Array:
 
 def _solution(
     setup: Setup, x0: Any, run: Run, system: Affine, spaces: tuple[AbstractSpace, AbstractSpace],
-    options: Options, timing: dict[str, float],
+    options: Options, timing: dict[str, float], pieces: list[Piece],
 ) -> Solution:  # fmt: skip
     rows, dtype, problem = run.rows, x0.dtype, setup.problem
     u0 = problem.zero_control(x0)
@@ -174,7 +174,7 @@ def _solution(
         result=getattr(RESULTS, run.result),
         records=_trajectory(run) if options.dense else None,
         events=None,
-        enclosed=False,
+        enclosed=options.measure and all(piece.is_proved for piece in pieces),
         plan=None,
         setup=setup,
     )  # fmt: skip

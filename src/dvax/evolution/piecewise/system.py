@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..._tree import Tree
-from ...errors import Problems, input_error
+from ...errors import InputError, Problems, input_error
 from ...problem import Problem
 from ...programs.intermediate import intermediate, subtracted
 from ...vi import analyse, independent
@@ -90,6 +90,15 @@ def affine(problem: Problem, t0: Any, x0: Tree, args: Any) -> Affine:
     A, B, M, C, low, up, *sizes = (np.asarray(v, float) for v in matrices)
     n, m = B.shape
     return Affine(A, B, M, C, low, up, np.zeros(m, bool), np.eye(n + m), Sizes(*sizes))
+
+
+def is_affine(problem: Problem, t0: Any, x0: Tree, args: Any) -> bool:
+    """Return whether the code of f, h and K proves that `affine` has a system of this problem."""
+    try:
+        _check(problem, t0, x0, problem.zero_control(x0), args)
+    except InputError:
+        return False
+    return True
 
 
 def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
