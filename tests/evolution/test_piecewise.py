@@ -79,7 +79,9 @@ def test_piecewise_defect_bounds_the_error():
     level = 101.0 / 51.0
     error = abs(float(sol.xs[1]) - level - (2 - level) * np.exp(-51.0 * (4 - np.log(3.0))))
     assert error <= float(bound.x[-1]) + 1e-14 and float(bound.x[-1]) < 1e-10
-    assert bound.status == "estimated" and not sol.enclosed
+    assert bound.status == "proved" and sol.enclosed
+    # Without constants the steps do not need their defect.
+    assert dvax.solve(problem, 4.0, 0.0, 4.0, method=dvax.PiecewiseLinear()).defect is None
 
 
 def test_piecewise_oscillation_beside_a_constraint_needs_no_step_per_period():

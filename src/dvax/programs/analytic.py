@@ -63,13 +63,15 @@ def complex_radius(
     time = jnp.asarray(low)
     program, shape = jax.make_jaxpr(fn, return_shape=True)(time)
     middle = 0.5 * (low + high)
-    t = Analytic(middle, 0.5 * (high - low), middle + 0j, reach)
-    try:
-        found = interpret(program, [t], _DOMAIN)
-    except _UnknownOperation:
-        sizes = [int(np.prod(leaf.shape)) for leaf in jtu.tree_leaves(shape)]
-        return jnp.full(sum(sizes), jnp.inf, time.dtype)
-    radius = jnp.concatenate([_lifted(v, time.dtype).reach.ravel() for v in found])
+    # Centers of the second discs are complex, and their radii are real.
+    with jax.numpy_dtype_promotion("standard"):
+        t = Analytic(middle, 0.5 * (high - low), middle + 0j, reach)
+        try:
+            found = interpret(program, [t], _DOMAIN)
+        except _UnknownOperation:
+            size = sum(int(np.prod(leaf.shape)) for leaf in jtu.tree_leaves(shape))
+            return jnp.full(size, jnp.inf, time.dtype)
+        radius = jnp.concatenate([_lifted(v, time.dtype).reach.ravel() for v in found])
     return jnp.where(jnp.isnan(radius), jnp.inf, radius)
 
 

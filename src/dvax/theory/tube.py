@@ -154,7 +154,9 @@ class Tube:
         self.size = sum(map(np.size, jtu.tree_leaves(setup.x0)))
         unknowns = self.size + sum(map(np.size, jtu.tree_leaves(self.system.u0)))
         self.by_modes = isinstance(setup.method, PiecewiseLinear) or (
-            unknowns <= _MAX_BY_MODES and is_affine(problem, t0, setup.x0, setup.args)
+            unknowns <= _MAX_BY_MODES
+            and setup.dtype == np.float64  # with less precision its inputs have large errors
+            and is_affine(problem, t0, setup.x0, setup.args)
         )
         # Factors of the tolerances of x_c, and of the smallest reach of a tube; and whether constants
         # need bounds of u.

@@ -41,7 +41,7 @@ def application(text: str) -> Any:
 CASES = [
     (contact, "ETD2RK", "proved"),
     (contact, "ETD4RK", "estimated"),
-    (application(CIRCUIT), "PiecewiseLinear", "estimated"),
+    (application(CIRCUIT), "PiecewiseLinear", "proved"),
     (application(CIRCUIT), "ETD4RK", "estimated"),
     (application(CIRCUIT), "ETD2RK", "estimated"),
     (application(FRAME), "ETD2RK", "proved"),

@@ -140,6 +140,7 @@ class StepDefect(NamedTuple):
     of_row: float
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a defect may be infinite
 def step_defect(
     system: Affine, equations: Equations, norms: Norms, part: Polynomials, start: Array, end: Array,
     input_error: Array,

@@ -371,10 +371,13 @@ class Run:
             x, y = step.evaluate(thetas)
             q = self.piece.evaluate((begin + thetas * step.length) / piece.length)[:, n:]
             w = y @ self.original.M.T + x @ self.original.C.T + q
+            defect = self.defect + of_row, self.law_defect
+            # The start of the run is exact.
+            starts = (self.accepted == 1) & (thetas == 0.0)
             self.rows += [
                 Row(
-                    float(self.times[first + k]), x[k], y[k], w[k],
-                    (self.defect + of_row, self.law_defect), completed_defect,
+                    float(self.times[first + k]), self.x if starts[k] else x[k], y[k], w[k],
+                    (0.0, 0.0) if starts[k] else defect, completed_defect,
                     None if bounds is None else bounds[k],
                 )
                 for k in range(len(offsets))

@@ -10,6 +10,7 @@ occurs: where d is prescribed, p remains an unknown beside x. A small M (the res
 therefore never becomes a large entry of a matrix.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,6 +22,7 @@ import numpy as np
 from ..._tree import Tree
 from ...errors import InputError, Problems, input_error
 from ...problem import Problem
+from ...programs.derivatives_of_operations import has_derivative, of_operations
 from ...programs.intermediate import intermediate, subtracted
 from ...vi import analyse, independent
 
@@ -115,9 +117,7 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
     t, both = jnp.asarray(t0, jnp.result_type(x0)), (x0, u0)
     wrong = Problems()
     for name, fn in (("f", problem.f), ("h", problem.h)):
-        joint = lambda t, both, fn=fn: fn(t, *both, args)  # noqa: E731
-        constant = independent(lambda t, joint=joint: jax.jacfwd(joint, argnums=1)(t, both), t)
-        if not (constant and analyse(lambda both, joint=joint: joint(t, both), both).affine):
+        if not _is_affine(lambda t, both, fn=fn: fn(t, *both, args), t, both):
             wrong.add(
                 f"{place}: {name}", "code that is not proved to be affine",
                 f"{name} must be affine in (x, u) with coefficients that do not depend on t",
@@ -132,6 +132,19 @@ def _check(problem: Problem, t0: Any, x0: Tree, u0: Tree, args: Any) -> None:
     wrong.raise_any()
 
 
+def _is_affine(fn: Callable[..., Any], t: Any, both: Any) -> bool:
+    """Return whether the code of a function of t and (x, u) proves that it is affine in these, with
+    constant coefficients."""
+    try:
+        plain = of_operations(fn, t, both)
+    except NotImplementedError:
+        return False
+    if not has_derivative(plain, t, both):
+        return False
+    constant = independent(lambda t: jax.jacfwd(plain, argnums=1)(t, both), t)
+    return constant and analyse(lambda both: plain(t, both), both).affine
+
+
 @eqx.filter_jit
 def _matrices(problem: Problem, args: Any, x0: Any, u0: Any, t: Any) -> tuple[Any, ...]:
     n, m = x0.size, u0.size
@@ -143,7 +156,8 @@ def _matrices(problem: Problem, args: Any, x0: Any, u0: Any, t: Any) -> tuple[An
 
     def slopes(fn: Any) -> tuple[Any, Any]:
         at = lambda x, u: fn(t, as_state(x), as_control(u), args).ravel()  # noqa: E731
-        return jax.jacfwd(at, argnums=(0, 1))(x0.ravel(), u0.ravel())
+        point = x0.ravel(), u0.ravel()
+        return jax.jacfwd(of_operations(at, *point), argnums=(0, 1))(*point)
 
     (f_x, f_u), (h_x, h_u) = slopes(problem.f), slopes(problem.h)
     law, size = inverse - h_u @ inverse, jnp.abs(inverse) + jnp.abs(h_u) @ jnp.abs(inverse)
