@@ -308,3 +308,31 @@ def test_directional_derivative_accepts_single_precision_and_none_in_args():
     )
     assert seen.x.actual[-1] == pytest.approx(0.064, abs=1e-3)
     assert seen.x.certified[-1] == pytest.approx(0.3437, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_sets_that_do_not_show_their_kinks_are_refused():
+    def weakly_active(K):
+        # u = proj_K((1.5, 0.5) + x): y₁ + y₂ ≤ 1 is active, and y₂ ≥ 0 as well, without a multiplier
+        # for x ∈ span(−1, 1).
+        return dvax.Problem(
+            A=dvax.generators.Zero(), P=ONE, K=K, f=lambda t, x, u, a: 0.0 * x,
+            h=lambda t, x, u, a: jnp.array([1.5, 0.5]) + x, control_space=dvax.spaces.Euclidean(2),
+        )  # fmt: skip
+
+    both = dvax.sets.Intersection(
+        dvax.sets.Box(0.0, jnp.inf), dvax.sets.HalfSpace(jnp.ones(2), 1.0)
+    )
+    with pytest.raises(dvax.InputError, match=r"Intersection.*ConstrainedBox"):
+        dvax.directional_derivative(weakly_active(both), jnp.zeros(2), 0.0, 1.0, dx0=jnp.ones(2))
+    boxes = dvax.sets.Intersection(dvax.sets.Box(0.0, jnp.inf), dvax.sets.Box(-1.0, 1.5))
+    found = [
+        dvax.directional_derivative(
+            weakly_active(K), jnp.array([-0.2, -0.5]), 0.0, 1.0, dx0=jnp.array([1.0, d])
+        )
+        for K in (boxes, dvax.sets.Box(0.0, 1.5))
+        for d in (1.0, -1.0)
+    ]
+    for one, other in zip(found[:2], found[2:], strict=True):
+        np.testing.assert_array_equal(one.dus, other.dus)
+        assert len(one.kinks) == len(other.kinks) == 1

@@ -5,8 +5,8 @@ it in the complex plane, to which the function is continued. Comparisons, steps 
 by the first: what the program computes for all real t of the interval is then one analytic function.
 Where that is not so, the radius is infinite.
 
-Source of the bound that this serves: Trefethen, *Approximation Theory and Approximation Practice* (2013),
-Theorem 8.2.
+Source of the bound that this serves: Trefethen, *Approximation Theory and Approximation Practice*
+(2013), Theorem 8.2.
 """
 
 from collections.abc import Callable
@@ -54,12 +54,10 @@ class _UnknownOperation(Exception):
     pass
 
 
-def complex_radius(
-    fn: Callable[[Any], Any], low: Any, high: Any, reach: Any
-) -> jax.Array:
-    """Return a bound on |f(t) − c| for a complex number c and all complex t within `reach` of the middle
-    of the real interval [low, high], entry by entry of the flat output; infinite where f is not proved
-    to be analytic there."""
+def complex_radius(fn: Callable[[Any], Any], low: Any, high: Any, reach: Any) -> jax.Array:
+    """Return a bound on |f(t) − c| for a complex number c and all complex t within `reach` of the
+    middle of the real interval [low, high], entry by entry of the flat output; infinite where f is not
+    proved to be analytic there."""
     time = jnp.asarray(low)
     program, shape = jax.make_jaxpr(fn, return_shape=True)(time)
     middle = 0.5 * (low + high)
@@ -314,9 +312,7 @@ def _extremum(sign: float) -> Rule:
         if not is_real(eqn.outvars[0].aval):
             return _whole_numbers(eqn, operands)
         shape = eqn.outvars[0].aval.shape
-        a, b = (
-            Analytic(*(jnp.broadcast_to(part, shape) for part in _lifted(v))) for v in operands
-        )
+        a, b = (Analytic(*(jnp.broadcast_to(part, shape) for part in _lifted(v))) for v in operands)
         is_above, is_below = a.low >= b.high, a.high <= b.low
         return _chosen(a, b, is_above, is_below) if sign > 0 else _chosen(a, b, is_below, is_above)
 
@@ -419,9 +415,7 @@ def _table(degree: int) -> Rule:
         i = jnp.clip(first, 0, last)
         width = times[i + 1] - times[i]
         fixed = lambda v: _lifted(v, values.dtype)  # noqa: E731
-        share = _both(
-            _quotient, _both(_sum, t, fixed(-times[i])), fixed(width)
-        )
+        share = _both(_quotient, _both(_sum, t, fixed(-times[i])), fixed(width))
         v0, v1 = values[i], values[i + 1]
         share = Analytic(*(jnp.broadcast_to(part, v0.shape) for part in share))
         if degree == 0:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import _tree
 from ..errors import input_error
 from ..evolution import Solution
 from ..evolution.after_run import at_rows, steps_at
@@ -62,7 +63,7 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
     solution. A zero over less than a thousandth of the run counts as an instant.
 
     **Raises:** `dvax.InputError` if the solution has no dense output, or is of `dvax.Implicit` or
-    `dvax.PiecewiseLinear`.
+    `dvax.PiecewiseLinear`, or if K is a `dvax.sets.Intersection`, which does not show its kinks.
 
     ```python
     >>> import dvax
@@ -84,6 +85,7 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
             "the kinks between saved times are located on the steps of an exponential method",
             "Solve with dense=True and an exponential method",
         )
+    require_switches("dvax.sensitivity.kinks(sol)", sol.setup)
     count = int(sol.stats["steps"])
     if count == 0 or not switch_count(sol.setup):
         return []
@@ -92,6 +94,20 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
     for k in range(values.shape[1]):
         result += _kinks_of_switch(times, values[:, k], k, tol)
     return sorted(result)
+
+
+def require_switches(place: str, setup: Setup) -> None:
+    """Raise an `InputError` where no functions of the set change sign at the kinks."""
+    problem, x0, args = setup.problem, setup.x0, _tree.as_arrays(setup.args)
+    K, like = problem.set_at(setup.number("t0"), args), problem.zero_control(x0)
+    if K.switches(like, problem.spaces(x0)[1]) is None:
+        raise input_error(
+            place, f"a law on {type(K).__name__}",
+            "Dykstra's method does not determine which sets of an Intersection are active, so that "
+            "kinks of the response are not known",
+            "Write the set as dvax.sets.ConstrainedBox (limits of entries and of a few sums) or "
+            "dvax.sets.Polyhedron",
+        )  # fmt: skip
 
 
 def _sample_switches(sol: Solution, count: int) -> tuple[np.ndarray, np.ndarray]:

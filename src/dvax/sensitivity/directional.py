@@ -122,8 +122,9 @@ def directional_derivative(
 
     f and h are differentiated as in `jax.jvp`, with its convention at their own kinks.
 
-    **Returns:** a `dvax.Directional`. **Raises:** `dvax.InputError` if the direction does not fit;
-    `dvax.SolveError` if one of the two solves fails.
+    **Returns:** a `dvax.Directional`. **Raises:** `dvax.InputError` if the direction does not fit, or K
+    is a `dvax.sets.Intersection`, which does not show which constraints are active; `dvax.SolveError`
+    if one of the two solves fails.
 
     Source: the affine variational inequality on the critical cone (Robinson 1980); Pang and Stewart
     (2009) for the differential equation.

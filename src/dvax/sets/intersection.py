@@ -124,8 +124,14 @@ class Intersection(AbstractSet):
         return _tree.where(converged, x, failed)
 
     def switches(self, z: Tree, space: AbstractSpace) -> list[jax.Array] | None:
-        """Return None: Dykstra's method does not determine which sets are active."""
-        return None
+        """Return the distances from the bounds if K is a box, else None: Dykstra's method does not
+        determine which sets are active."""
+        bounds = self.intervals(z)
+        if bounds is None:
+            return None
+        lower, upper = bounds
+        gaps = _tree.sub(z, lower), _tree.sub(upper, z)
+        return [gap for side in gaps for gap in jtu.tree_leaves(side)]
 
     def intervals(self, like: Tree) -> tuple[Tree, Tree] | None:
         intervals = [K.intervals(like) for K in self.sets]

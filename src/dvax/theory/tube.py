@@ -5,8 +5,8 @@ linearisation has a matrix for each of many intervals of time, which are made sh
 large: where the law passes a kink, and its derivative is unknown while it may be on either side.
 
 x_c is computed by `ETD2RK`, whose steps have an enclosed defect, or, for a small system that is affine
-while no constraint changes, by `PiecewiseLinear`, whose defect is of the size of rounding errors, however
-stiff the system is.
+while no constraint changes, by `PiecewiseLinear`, whose defect is of the size of rounding errors,
+however stiff the system is.
 """
 
 from typing import Any, NamedTuple
@@ -66,7 +66,7 @@ _WIDENINGS = 4
 """Number of widths of a tube that are tried."""
 
 _MAX_BY_MODES = 16
-"""Largest number of unknowns of x and u together for which `PiecewiseLinear` replaces another method."""
+"""Largest number of unknowns of x and u for which `PiecewiseLinear` replaces another method."""
 
 _RTOL_BY_MODES = 1e-8
 """Smallest rtol for `PiecewiseLinear`."""
@@ -294,8 +294,18 @@ class Tube:
         if self.by_modes:
             own = {"method": PiecewiseLinear(), "rtol": max(rtol, _RTOL_BY_MODES)}
         found = solve(
-            self.problem, x, a, nodes[-1], self.args, times, atol=atol, constants=self.first,
-            horizon=self.span, max_steps=self.max_steps, throw=False, **own,
+            self.problem,
+            x,
+            a,
+            nodes[-1],
+            self.args,
+            times,
+            atol=atol,
+            constants=self.first,
+            horizon=self.span,
+            max_steps=self.max_steps,
+            throw=False,
+            **own,
         )
         self.latest_steps = int(found.stats["steps"])
         self.is_stopped = bool(found.result == RESULTS.max_steps)

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 
 from .._jax.jaxprs import ClosedJaxpr, Literal
 from ..problem import Problem

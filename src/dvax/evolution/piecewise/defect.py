@@ -1,9 +1,10 @@
 """How far the polynomials of a step are from a solution: a bound on the defect, rounding included.
 
-A step has polynomials X and Y in place of x and y, plus oscillations in closed form. The bound does not
-ask how they were found. In the mode of a step let F be the free entries. With z = M_FF⁻¹ w_F, the
-response Y − z satisfies w_F = 0, and differs from Y by rounding errors. The defect of the state equation
-is δ = x_c' − Ax_c − B(Y − z) − g, for one of three trajectories x_c, whichever has the smallest bound:
+A step has polynomials X and Y in place of x and y, plus oscillations in closed form. The bound does
+not ask how they were found. In the mode of a step let F be the free entries. With z = M_FF⁻¹ w_F, the
+response Y − z satisfies w_F = 0, and differs from Y by rounding errors. The defect of the state
+equation is δ = x_c' − Ax_c − B(Y − z) − g, for the one of three trajectories x_c that has the smallest
+bound:
 
 - x_c = X: then δ − Bz is a polynomial. But the derivative of X has large rounding errors;
 - x_c = x₀ + ∫(AX + BY + g): then δ − Bz = A(X − x_c), which is large where A is;
@@ -16,7 +17,7 @@ The response is a solution of the law, up to what its entries violate of the con
 violation of y is a distance of y from K, and one of w perturbs the law.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -152,11 +153,11 @@ def step_defect(
     unit = (n + m + 8.0) * _EPS
     of_g, of_q = input_error[:n], input_error[n:]
     g, q = part.inputs[:, :n], part.inputs[:, n:]
-    waves_x = [np.abs(v) for _, v, _ in part.waves]
     terms = _sum(part.x) @ sizes.A.T + _sum(part.y) @ sizes.B.T + _sum(g)
     rate = part.x @ system.A.T + part.y @ system.B.T + g
     of_waves, jumps = np.zeros(n), np.zeros(n)
-    first, last = start, end
+    first: Any = start
+    last: Any = end
     for rate_of, v, w in part.waves:
         size = abs(rate_of) * np.abs(v) + sizes.A @ np.abs(v) + sizes.B @ np.abs(w)
         of_waves += 2.0 * (np.abs(rate_of * v - system.A @ v - system.B @ w) + unit * size)
@@ -164,44 +165,63 @@ def step_defect(
         last = last - 2.0 * (np.exp(rate_of * part.length) * v).real
         jumps += (16.0 + abs(rate_of) * part.length) * _EPS * np.abs(v)
     law = _Law.of(system, equations, part, q, of_q, unit)
-    input_errors = part.length * _norm(norms.x, of_waves + of_g)
-    candidates = [
-        _of_polynomial(system, norms, part, rate, unit * terms, first, last),
-        _of_integral(system, norms, part, rate, unit * terms, first, last),
-    ]
+    beside, no_distance = of_waves + of_g, np.zeros(n)
+    of_polynomial = _of_polynomial(norms, part, rate, unit * terms, first, last)
+    of_integral, apart = _of_integral(system, norms, part, rate, unit * terms, first, last)
     charged = []
-    for total, apart in candidates:
-        state = total + input_errors
-        z, columns = law.correction(np.abs(system.C) @ apart)
-        of_z = part.length * _norm(norms.x, np.abs(columns).sum(axis=1))
-        charged.append((state + of_z, apart, z))
-    if charged[0][0] > 2.0 * candidates[0][0]:
-        z, columns = law.correction(np.zeros(m))
+    for total, distance in ((of_polynomial.total, no_distance), (of_integral, apart)):
+        z, columns = law.correction(np.abs(system.C) @ distance)
+        of_z = np.abs(columns).sum(axis=1)
+        charged.append((total + part.length * _norm(norms.x, beside + of_z), distance, z))
+    if min(charged, key=lambda found: found[0])[0] > 4.0 * of_polynomial.jumps:
+        _, columns = law.correction(np.zeros(m))
+        columns = np.hstack([columns, np.diag(of_polynomial.largest + beside)])
         propagated = _propagated(system, law, norms, part.length, columns, unit)
-        total = propagated.of_z + propagated.largest * (candidates[0][0] + input_errors)
-        charged.append((total, np.full(n, total) / norms.x, z))
-    state, apart, z = min(charged, key=lambda found: found[0])
-    of_state, of_law = law.violations(norms, apart, z)
+        total = propagated.of_columns + propagated.largest * of_polynomial.jumps
+        distance = total / norms.x
+        charged.append((total, distance, law.correction(np.abs(system.C) @ distance)[0]))
     row = sum((abs(r) * part.length * np.abs(v) for r, v, _ in part.waves), part.size())
-    state += _norm(norms.x, jumps) + of_state
-    return StepDefect(state, of_law, _norm(norms.x, _SUM * row))
+    of_start, of_row = _norm(norms.x, jumps), _norm(norms.x, _SUM * row)
+    found = []
+    for state, distance, z in sorted(charged, key=lambda one: one[0]):
+        of_state, of_law = law.violations(norms, distance, z)
+        found.append(StepDefect(state + of_start + of_state, of_law, of_row))
+        if of_law == 0.0:
+            break
+    gain = _gain(system, norms) if len(found) > 1 else 0.0
+    return min(found, key=lambda one: one.state + gain * one.law)
+
+
+def _gain(system: Affine, norms: Norms) -> float:
+    """Return by how much a perturbation of the law changes x', at most, up to rounding."""
+    M = norms.y[:, None] * system.M / norms.y
+    least = float(np.linalg.eigvalsh(0.5 * (M + M.T))[0])
+    return float(np.linalg.norm(norms.x[:, None] * system.B / norms.y, 2)) / max(least, 1e-300)
+
+
+class _OfPolynomial(NamedTuple):
+    """The defect of X: ∫‖δ‖ and jumps in `total`, the largest entries of |δ|, and the `jumps` alone."""
+
+    total: float
+    largest: Array
+    jumps: float
 
 
 def _of_polynomial(
-    system: Affine, norms: Norms, part: Polynomials, rate: Array, rounding: Array, first: Array,
-    last: Array,
-) -> tuple[float, Array]:  # fmt: skip
-    """Return the defect of X itself, with the jumps at its ends, and its distance 0 from X."""
+    norms: Norms, part: Polynomials, rate: Array, rounding: Array, first: Array, last: Array
+) -> _OfPolynomial:
+    """Return the defect of X itself, with the jumps at its ends."""
     c, scale = part.x, 2.0 / part.length
     residual = scale * (_DERIVATIVE @ c) - rate
     rounding = rounding + _SUM * scale * (_DERIVATIVE @ np.abs(c)).sum(axis=0)
     squares = np.einsum("ki,kj,ji->i", residual, _PRODUCTS, residual)
     mean = np.sqrt(np.maximum(norms.x**2 @ np.maximum(squares, 0.0), 0.0)) * (1.0 + 1e-12)
-    total = part.length * (mean + _norm(norms.x, rounding))
-    for signs, value in ((_SIGNS[:-1], first), (1.0, last)):
-        at_end, error = _running(c * np.reshape(signs, (-1, 1)) if np.ndim(signs) else c)
-        total += _norm(norms.x, np.abs(at_end - value) + error + _EPS * np.abs(value))
-    return float(total), np.zeros(c.shape[1])
+    jumps = 0.0
+    for row, value in ((c * _SIGNS[:-1, None], first), (c, last)):
+        at_end, error = _running(row)
+        jumps += _norm(norms.x, np.abs(at_end - value) + error + _EPS * np.abs(value))
+    total = part.length * (mean + _norm(norms.x, rounding)) + jumps
+    return _OfPolynomial(float(total), _sum(residual) + rounding, jumps)
 
 
 def _of_integral(
@@ -237,7 +257,13 @@ class _Law(NamedTuple):
 
     @classmethod
     def of(
-        cls, system: Affine, equations: Equations, part: Polynomials, q: Array, of_q: Array, unit: float
+        cls,
+        system: Affine,
+        equations: Equations,
+        part: Polynomials,
+        q: Array,
+        of_q: Array,
+        unit: float,
     ) -> "_Law":
         """Return the law, with errors `of_q` of q."""
         sizes = system.sizes
@@ -290,7 +316,7 @@ class _Propagation(NamedTuple):
     """Bounds on the sum of ∫‖e^{Cs}b‖ for columns b, over the length of a step, and on the largest
     ‖e^{Cs}‖, for the matrix C of its mode."""
 
-    of_z: float
+    of_columns: float
     largest: float
 
 
@@ -314,16 +340,16 @@ def _propagated(
     b = scale[:, None] * columns
     s = length * 0.5**halvings
     first = sum(np.linalg.norm(b, axis=0)) * s * np.exp(growth * s)
-    factor, of_z, largest = _exponential(C * s), float(first), float(np.exp(growth * s))
+    factor, of_columns, largest = _exponential(C * s), float(first), float(np.exp(growth * s))
     error = float(np.linalg.norm(rounding)) + len(C) * 32.0 * _EPS * float(np.linalg.norm(C))
     for _ in range(halvings):
         more = np.exp(growth * s)
         at = np.linalg.norm(factor @ b, axis=0) + s * error * largest**2 * np.linalg.norm(b, axis=0)
-        of_z += float(at.sum()) * s * more
+        of_columns += float(at.sum()) * s * more
         here = float(np.linalg.norm(factor, 2)) + s * error * largest**2
         largest = max(largest, here * more)
         factor, s = factor @ factor, 2.0 * s
-    return _Propagation(of_z, largest)
+    return _Propagation(of_columns, largest)
 
 
 def _exponential(M: Array) -> Array:

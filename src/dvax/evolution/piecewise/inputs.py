@@ -109,8 +109,8 @@ def _samples(problem: Problem, args: Any, x: Tree, u: Tree, ts: Any) -> Any:
 
 @eqx.filter_jit
 def _radii(problem: Problem, args: Any, x: Tree, u: Tree, low: Any, high: Any) -> Any:
-    """Return bounds on (g, q), up to constants, in discs around intervals of t: one row per interval and
-    per ρ."""
+    """Return bounds on (g, q), up to constants, in discs around intervals of t: one row per interval
+    and per ρ."""
 
     def one(low: Any, high: Any, rho: Any) -> Any:
         reach = 0.25 * (high - low) * (rho + 1.0 / rho)

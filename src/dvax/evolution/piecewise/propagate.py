@@ -105,7 +105,9 @@ def _data(problem: Problem, t0: float, x0: jax.Array, args: Any) -> _Data:
         likes = x0, problem.zero_control(x0)
         norms = Norms(
             *(
-                np.asarray(_norms(space, jnp.eye(v.size, dtype=v.dtype).reshape(-1, *v.shape)), float)
+                np.asarray(
+                    _norms(space, jnp.eye(v.size, dtype=v.dtype).reshape(-1, *v.shape)), float
+                )
                 for space, v in zip(problem.spaces(x0), likes, strict=True)
             )
         )

@@ -386,9 +386,7 @@ class Run:
             self.steps.append(step)
         self.x = after
 
-    def _bounds_at(
-        self, part: Polynomials | None, step: Step, thetas: Array
-    ) -> list[Array] | None:
+    def _bounds_at(self, part: Polynomials | None, step: Step, thetas: Array) -> list[Array] | None:
         """Return bounds on (x, y) from each of these θ of a step back to the last saved time, if bounds
         are tracked. The step has a `part` unless its length is zero."""
         if not self.track_bounds:
