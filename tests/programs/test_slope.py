@@ -381,3 +381,26 @@ def test_a_chain_keeps_apart_two_values_that_one_program_computes():
     part = SlopeEnclosure(fn, (jnp.zeros(2),), (0,))(interval(low, high)).out.parts[0]
     exact = jax.grad(fn)(jnp.asarray([2.0, 0.0]))[0]
     assert exact == 4.0 and part.center[0] + part.radius[0] >= 4.0
+
+
+@pytest.mark.parametrize(
+    ("fn", "is_known"),
+    [
+        (lambda x: jnp.nan_to_num(0.0 * jnp.log(x), nan=-2.0), False),
+        (lambda x: jnp.where(jnp.isnan(jnp.sqrt(x)), -1.0, 1.0), False),
+        (lambda x: jnp.where(jnp.sqrt(x) >= 0.0, 1.0, -1.0), False),
+        (lambda x: jnp.nan_to_num(0.0 / x) + x, False),
+        (lambda x: jnp.where(jnp.power(-2.0, x) < 9.0, 1.0, -1.0), False),
+        (lambda x: jnp.where(x > 2.0, jnp.log(x), x), True),
+        (lambda x: jnp.where(jnp.isnan(x), 0.0, x), True),
+        (lambda x: jnp.nan_to_num(0.0 * jnp.exp(x) + 0.0 * x**3), True),
+        (lambda x: jnp.nan_to_num(jnp.sqrt(2.0 + x) - x), True),
+        (lambda x: jnp.sqrt(1.0 + x * x - x), True),
+    ],
+)
+def test_values_that_may_be_nan_decide_no_comparison(fn, is_known):
+    """A factor 0 does not hide that a function is not defined in a region, and that code which tests
+    for NaN branches there."""
+    found = SlopeEnclosure(fn, (jnp.zeros(()),), (0,))(interval(-1.0, 1.5)).out
+    radius = found.parts[0].radius if found.parts else 0.0
+    assert np.isfinite(radius) == is_known

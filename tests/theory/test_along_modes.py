@@ -94,9 +94,33 @@ class Random:
         return modes
 
     def exact(self):
-        return follow(
-            self.modes(), self.x0, [(0.0, np.array([1.0, 0.0, 1.0]))], self.ts, fewest=3000
-        )[0]
+        """Return x at `ts`, and the number of switchings."""
+        sources = [(0.0, np.array([1.0, 0.0, 1.0]))]
+        return follow(self.modes(), self.x0, sources, self.ts, fewest=3000)
+
+    def integrated(self):
+        """Return x at `ts` by a method of SciPy, which misses no switching for long."""
+        modes = {
+            key: tuple(np.array(v, float) for v in (mode.Z, mode.conditions))
+            for key, mode in self.modes().items()
+        }
+        n, w = len(self.x0), self.omega
+
+        def rate(t, x):
+            z = np.concatenate([x, [1.0, np.sin(w * t), np.cos(w * t)]])
+            valid = max(modes, key=lambda key: (modes[key][1] @ z).min())
+            return (modes[valid][0] @ z)[:n]
+
+        return scipy.integrate.solve_ivp(
+            rate,
+            (0.0, self.ts[-1]),
+            self.x0,
+            "Radau",
+            self.ts,
+            rtol=1e-10,
+            atol=1e-12,
+            max_step=2e-3,
+        ).y.T
 
 
 CASES = [(seed, stiff) for seed in range(40) for stiff in (False, True)]
@@ -106,13 +130,18 @@ CASES = [(seed, stiff) for seed in range(40) for stiff in (False, True)]
 @pytest.mark.parametrize(("seed", "stiff"), mostly_thorough(CASES, CASES[2:6]))
 def test_the_bound_of_random_modes_exceeds_the_error_and_is_of_the_size_of_rounding(seed, stiff):
     case = Random(seed, stiff)
-    problem, exact = case.problem(), case.exact()
+    problem, (exact, count) = case.problem(), case.exact()
+    modes = dvax.solve(problem, case.x0, 0.0, case.ts[-1], method=dvax.PiecewiseLinear())
+    tolerance = 0.0
+    if count != modes.stats["switchings"]:
+        # The samples of `follow` have missed a short mode.
+        exact, tolerance = case.integrated(), 1e-7 * (1.0 + np.abs(exact).max())
     for method in (dvax.PiecewiseLinear(), None):
         sol = dvax.solve(problem, case.x0, 0.0, case.ts[-1], ts=case.ts, method=method)
         bound = dvax.bound_error(problem, sol)
         error = np.linalg.norm(np.asarray(sol.xs) - exact, axis=1)
         most = np.asarray(bound.x)
-        assert bound.status == "proved" and (error <= most).all(), (method, error, most)
+        assert bound.status == "proved" and (error <= most + tolerance).all(), (error, most)
         # The trajectory along which it is proved is exact to rounding, which errors multiply.
         assert most[-1] < 1.001 * error[-1] + 1e-6 * (1.0 + np.abs(exact).max())
 

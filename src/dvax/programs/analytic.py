@@ -21,7 +21,7 @@ from .._jax.jaxprs import bind
 from .interpreter import Domain, Rule, interpret, is_real, same_for
 from .primitives import COMPARING, LOGICAL, REARRANGING, STEPWISE, SUMMING
 
-_ROUNDING = 64.0
+_ROUNDING = 4.0
 """By so many roundings the radius of each result is larger."""
 
 

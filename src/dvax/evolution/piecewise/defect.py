@@ -17,7 +17,7 @@ The response is a solution of the law, up to what its entries violate of the con
 violation of y is a distance of y from K, and one of w perturbs the law.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -155,17 +155,16 @@ def step_defect(
     g, q = part.inputs[:, :n], part.inputs[:, n:]
     terms = _sum(part.x) @ sizes.A.T + _sum(part.y) @ sizes.B.T + _sum(g)
     rate = part.x @ system.A.T + part.y @ system.B.T + g
-    of_waves, jumps = np.zeros(n), np.zeros(n)
-    first: Any = start
-    last: Any = end
+    of_oscillations, jumps = np.zeros(n), np.zeros(n)
+    first, last = start, end
     for rate_of, v, w in part.waves:
         size = abs(rate_of) * np.abs(v) + sizes.A @ np.abs(v) + sizes.B @ np.abs(w)
-        of_waves += 2.0 * (np.abs(rate_of * v - system.A @ v - system.B @ w) + unit * size)
-        first = first - 2.0 * v.real
-        last = last - 2.0 * (np.exp(rate_of * part.length) * v).real
+        of_oscillations += 2.0 * (np.abs(rate_of * v - system.A @ v - system.B @ w) + unit * size)
+        first = first - 2.0 * np.real(v)
+        last = last - 2.0 * np.real(np.exp(rate_of * part.length) * v)
         jumps += (16.0 + abs(rate_of) * part.length) * _EPS * np.abs(v)
     law = _Law.of(system, equations, part, q, of_q, unit)
-    beside, no_distance = of_waves + of_g, np.zeros(n)
+    beside, no_distance = of_oscillations + of_g, np.zeros(n)
     of_polynomial = _of_polynomial(norms, part, rate, unit * terms, first, last)
     of_integral, apart = _of_integral(system, norms, part, rate, unit * terms, first, last)
     charged = []

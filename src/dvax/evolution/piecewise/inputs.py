@@ -201,10 +201,15 @@ def build_pieces(
     starts, lengths = (np.array([getattr(p, name) for p in pieces]) for name in ("start", "length"))
     c = np.einsum("ij,kjl->kil", _TO_COEFFICIENTS, sample(starts, lengths, _POINTS))
     # The inputs may have other values at the knots themselves, up to a few roundings of t.
-    edge = np.minimum(_EDGE * eps * (np.abs(starts) + lengths), 0.01 * lengths)
+    rounding = _EDGE * eps * (np.abs(starts) + lengths)
+    edge = np.minimum(rounding, 0.01 * lengths)
     ends = (jnp.asarray(_padded(v), dtype) for v in (starts + edge, starts + lengths - edge))
     radii = np.asarray(_radii(problem, args, x, u, *ends), float)[: len(pieces)]
     bounds = np.min(_INTERPOLATION[:, None] * radii, axis=1)
+    # A piece of some roundings of t next to a knot has a value of one side or of the other.
+    sizes = np.pad(np.abs(c).sum(axis=1), ((1, 1), (0, 0)))
+    around = sizes[:-2] + sizes[1:-1] + sizes[2:]
+    bounds = np.where((lengths <= 4.0 * rounding)[:, None], around, bounds)
     return [
         _proved(piece, of_interpolant, row, float(share))
         for piece, of_interpolant, row, share in zip(pieces, bounds, c, edge / lengths, strict=True)
@@ -235,7 +240,7 @@ _ELLIPSES = np.array([2.0, 3.0, 5.0, 8.0, 13.0, 21.0, 50.0])
 _INTERPOLATION = 4.0 * _ELLIPSES**-STAGES / (_ELLIPSES - 1.0)
 """The error of interpolation in Chebyshev points, for a function of modulus ≤ 1 in each ellipse."""
 
-_EDGE = 64.0
+_EDGE = 256.0
 
 
 def _close_gaps(pieces: list[Piece]) -> list[Piece]:

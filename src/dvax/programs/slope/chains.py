@@ -98,7 +98,8 @@ class Chains:
         parts = mapped(root.parts, lambda part: scaled(part, down, up))
         if any(part.full != value.parts[k].full for k, part in parts.items()):
             return value
-        return sharper(value, Slope(np.min(found.low, axis=0), np.max(found.high, axis=0), parts))
+        low, high = np.min(found.low, axis=0), np.max(found.high, axis=0)
+        return sharper(value, Slope(low, high, parts, undefined=found.undefined))
 
     def _at(self, value: Slope, root: Slope, piece: Slope) -> Slope | None:
         """Return the value with `piece` in place of its root; None where a rule does not cover it."""

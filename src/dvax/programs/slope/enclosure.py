@@ -106,7 +106,8 @@ class SlopeEnclosure:
 def _elementwise(eqn: Any, operands: list[Any]) -> Slope | None:
     """Return the result of an elementwise operation, None where its rule does not cover it."""
     result = ELEMENTWISE[eqn.primitive.name](eqn, operands)
-    return None if result is None else _without_nan(result)
+    inherited = any(is_slope(v) and v.undefined for v in operands)
+    return None if result is None else _without_nan(_marked(result, inherited))
 
 
 def _apply(
@@ -123,15 +124,40 @@ def _apply(
     if result is None:
         return None
     results = result if isinstance(result, list) else [result]
-    values = [_constant_if_decided(_without_nan(x)) if is_slope(x) else x for x in results]
+    inherited = _may_be_undefined(eqn, operands)
+    if inherited:
+        # NaN decides no comparison as its range does.
+        results = [
+            _anything(operands, out.aval) if is_slope(x) and x.low.dtype == bool else x
+            for x, out in zip(results, eqn.outvars, strict=True)
+        ]
+    values = [
+        _constant_if_decided(_without_nan(_marked(x, inherited))) if is_slope(x) else x
+        for x in results
+    ]
     if recorder is None or radial is None:
         return values
     values = [recorder.result(x, eqn, operands, k) for k, x in enumerate(values)]
     if is_slope(values[0]):
         for whole in (of_exponentials(eqn, operands, values[0]), radial.of(values[0])):
             if whole is not None:
-                values[0] = sharper(values[0], _without_nan(whole))
+                values[0] = sharper(values[0], _without_nan(_marked(whole, False)))
     return values
+
+
+def _marked(x: Slope, inherited: bool) -> Slope:
+    """Return a result with the mark whether it may be NaN."""
+    has_nan = x.low.dtype.kind == "f" and bool((np.isnan(x.low) | np.isnan(x.high)).any())
+    return x._replace(undefined=inherited or has_nan or x.undefined)
+
+
+def _may_be_undefined(eqn: Any, operands: list[Any]) -> bool:
+    """Return whether the result of an operation may depend on a value that may be NaN."""
+    flags = [is_slope(v) and v.undefined for v in operands]
+    if eqn.primitive.name == "select_n" and any(flags) and not is_slope(operands[0]):
+        which = np.asarray(operands[0]).astype(int)
+        return any(flag and bool((which == k).any()) for k, flag in enumerate(flags[1:]))
+    return any(flags)
 
 
 _ARITHMETIC = {
@@ -175,7 +201,8 @@ def _anything(operands: list[Any], aval: Any) -> Slope:
             parts[k] = Part(np.zeros(shape), np.full(shape, np.inf), True)
     if np.issubdtype(aval.dtype, np.bool_):
         return Slope(np.zeros(aval.shape, bool), np.ones(aval.shape, bool), parts)
-    return Slope(np.full(aval.shape, -np.inf), np.full(aval.shape, np.inf), parts)
+    whole = np.full(aval.shape, np.inf)
+    return Slope(-whole, whole, parts, undefined=True)
 
 
 def _constant_if_decided(x: Slope) -> Any:
@@ -194,4 +221,4 @@ def _without_nan(x: Slope) -> Slope:
             p = Part(np.where(unknown, 0.0, p.center), np.where(unknown, np.inf, p.radius), p.full)
         parts[k] = p
     low = np.where(np.isnan(x.low), -np.inf, x.low)
-    return Slope(low, np.where(np.isnan(x.high), np.inf, x.high), parts)
+    return x._replace(low=low, high=np.where(np.isnan(x.high), np.inf, x.high), parts=parts)

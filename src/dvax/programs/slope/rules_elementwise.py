@@ -62,7 +62,8 @@ def _div(eqn: Any, operands: list[Any]) -> Slope | None:
     if not is_real(eqn.outvars[0].aval):
         return None  # integers are divided with a remainder
     x, y = _lifted(eqn, operands)
-    return multiplied(x, _composed(integer_power(-1), y))
+    inverse = _composed(integer_power(-1), y)
+    return multiplied(x, inverse)._replace(undefined=bool(np.isnan(inverse.low).any()))
 
 
 def _neg(eqn: Any, operands: list[Any]) -> Slope:

@@ -36,13 +36,15 @@ class Part(NamedTuple):
 class Slope(NamedTuple):
     """The bounds low ≤ q ≤ high, and ∂q/∂vₖ for every k in `parts`; q does not depend on other vₖ.
 
-    `source`: how q was computed (`sources.Source`), if that is kept.
+    `source`: how q was computed (`sources.Source`), if that is kept; `undefined`: whether q may be NaN
+    somewhere, as log x is for x < 0, or was computed from such values.
     """
 
     low: Values
     high: Values
     parts: dict[int, Part]
     source: Any = None
+    undefined: bool = False
 
 
 def interval(low: Any, high: Any) -> Slope:
@@ -135,7 +137,8 @@ def sharper(a: Slope, b: Slope) -> Slope:
         is_better = q.radius < p.radius
         center, radius = (np.where(is_better, v, w) for v, w in zip(q[:2], p[:2], strict=True))
         parts[k] = Part(center, radius, p.full)
-    return Slope(np.maximum(a.low, b.low), np.minimum(a.high, b.high), parts, a.source)
+    low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
+    return Slope(low, high, parts, a.source, a.undefined and b.undefined)
 
 
 def hull(a: Part, b: Part) -> Part:
