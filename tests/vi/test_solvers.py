@@ -284,3 +284,23 @@ def test_newton_from_zero_solves_the_problem_of_fathi_in_two_steps_an_unknown():
     )  # fmt: skip
     np.testing.assert_allclose(np.asarray(y.y), np.eye(size)[0], atol=1e-11)
     assert int(y.evaluations) <= 2 * size
+
+
+def test_projection_that_returns_to_a_corner_with_a_smaller_step_is_no_cycle():
+    rng = np.random.default_rng(13)
+    M = rng.normal(size=(24, 5, 5))
+    M = 0.3 * M @ M.swapaxes(1, 2) + 0.3 * np.eye(5) + (M - M.swapaxes(1, 2))
+    q = 3.0 * rng.normal(size=(24, 5))
+    low, width = rng.normal(size=(24, 5)), rng.uniform(0.2, 2.0, size=24)
+    M, q, low, high = M[5], q[5], low[5], low[5] + width[5]
+
+    def F(y, args):
+        return M @ y + q + 0.5 * jnp.tanh(y) + 0.5 * y**3
+
+    found = dvax.solve_vi(
+        F, dvax.sets.Box(low, high), jnp.zeros(5), solver=dvax.vi.Projection(), tol=1e-7
+    )
+    assert successful(found)
+    y = np.asarray(found.y)
+    natural = y - np.clip(y - (M @ y + q + 0.5 * np.tanh(y) + 0.5 * y**3), low, high)
+    assert np.abs(natural).max() < 1e-6

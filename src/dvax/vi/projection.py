@@ -65,14 +65,16 @@ class Projection(AbstractSolver):
             z = vi.K.project(_tree.sub(y, _tree.scale(lam, Fy)), vi.space)
             Fz = vi.F(z)
             w = residual_vector(Fz, Fy, y, z, lam)
+            shrinks: Any = False  # then a point that was there before is no cycle
             if contracting_step is None:
                 residual = vi.space.norm(w)
                 decreased = residual <= 0.999 * least
+                shrinks = ~decreased
                 failures = jnp.where(decreased, failures, failures + 1.0)
                 least = jnp.minimum(least, residual)
             # A proved λ may be arbitrarily small, so 1/L_F is reported: the loop must not reject it.
             step = lam if contracting_step is None else jnp.asarray(1.0 / vi.L_F, lam.dtype)
-            trial = Trial(z, w, Fz, step, [z], 1, base=(y, lam))
+            trial = Trial(z, w, Fz, step, [z], 1, may_repeat=shrinks, base=(y, lam))
             return (z, Fz, first, failures, least), trial
 
         return iterate(

@@ -242,6 +242,12 @@ def _of_integral(
     return float(total + _norm(norms.x, jump)), distance
 
 
+def law_rounding(system: Affine, x: Array, y: Array, q: Array) -> Array:
+    """Return a bound on the rounding errors of My + Cx + q."""
+    sizes, unit = system.sizes, (sum(system.B.shape) + 8.0) * _EPS
+    return unit * (np.abs(y) @ sizes.M.T + np.abs(x) @ sizes.C.T + np.abs(q))
+
+
 class _Law(NamedTuple):
     """The law of a step in its mode: w with its rounding `error`, its waves and a mask of the free
     entries."""
@@ -267,8 +273,8 @@ class _Law(NamedTuple):
         """Return the law, with errors `of_q` of q."""
         sizes = system.sizes
         w = part.y @ system.M.T + part.x @ system.C.T + q
-        terms = _sum(part.y) @ sizes.M.T + _sum(part.x) @ sizes.C.T + _sum(q)
-        error, waves = unit * terms + of_q, []
+        error = law_rounding(system, *(_sum(v) for v in (part.x, part.y, q))) + of_q
+        waves = []
         for rate, of_x, of_y in part.waves:
             error = error + 2.0 * unit * (sizes.M @ np.abs(of_y) + sizes.C @ np.abs(of_x))
             waves.append((rate, system.M @ of_y + system.C @ of_x))

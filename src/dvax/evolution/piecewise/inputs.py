@@ -24,6 +24,9 @@ _POINTS = np.cos(np.pi * (np.arange(STAGES + 1) + 0.5) / (STAGES + 1))
 _TO_COEFFICIENTS = np.linalg.inv(np.polynomial.chebyshev.chebvander(_POINTS, STAGES))
 _LINE_SAMPLES = np.array([-0.93, -0.5441, 0.0713, 0.4129, 0.8537])
 _CHECK_POINTS = np.array([-0.9871, -0.4127, 0.0317, 0.3719, 0.8853])
+_SAMPLE_ROUNDOFF = 8.0
+"""Rounding error of a sample in the same units, if the code of f and h is exact to a few of them."""
+
 _ROUNDOFF_FACTOR = 64.0
 """Bound on the rounding error of a sample, in units of eps times the size of t and of the value."""
 
@@ -44,8 +47,9 @@ class Piece(NamedTuple):
     is_proved: bool = False
 
     def uncertainty(self) -> Array:
-        """Return the error of (g, q), that of the evaluation included."""
-        return self.error + self.noise + _EVALUATION * np.abs(self.coefficients).sum(axis=0)
+        """Return the error of (g, q), those of the samples and of the evaluation included."""
+        of_samples = _SAMPLE_ROUNDOFF / _ROUNDOFF_FACTOR * self.noise
+        return self.error + of_samples + _EVALUATION * np.abs(self.coefficients).sum(axis=0)
 
     def evaluate(self, positions: Array) -> Array:
         """Return (g, q), one row per relative position in [0, 1]."""
@@ -203,9 +207,17 @@ def build_pieces(
     # The inputs may have other values at the knots themselves, up to a few roundings of t.
     rounding = _EDGE * eps * (np.abs(starts) + lengths)
     edge = np.minimum(rounding, 0.01 * lengths)
-    ends = (jnp.asarray(_padded(v), dtype) for v in (starts + edge, starts + lengths - edge))
-    radii = np.asarray(_radii(problem, args, x, u, *ends), float)[: len(pieces)]
-    bounds = np.min(_INTERPOLATION[:, None] * radii, axis=1)
+
+    def errors(edge: Any) -> Array:
+        ends = (jnp.asarray(_padded(v), dtype) for v in (starts + edge, starts + lengths - edge))
+        radii = np.asarray(_radii(problem, args, x, u, *ends), float)[: len(pieces)]
+        return np.min(_INTERPOLATION[:, None] * radii, axis=1)
+
+    bounds = errors(0.0)
+    is_whole = np.isfinite(bounds).all(axis=1)
+    if not is_whole.all():
+        bounds = np.where(is_whole[:, None], bounds, errors(edge))
+    edge = np.where(is_whole, 0.0, edge)
     # A piece of some roundings of t next to a knot has a value of one side or of the other.
     sizes = np.pad(np.abs(c).sum(axis=1), ((1, 1), (0, 0)))
     around = sizes[:-2] + sizes[1:-1] + sizes[2:]

@@ -144,10 +144,9 @@ def _solution(
     # One projection step as in `dvax.vi.certificate`, simplified for affine F.
     projection_step = ys - np.clip(ys - tau * w, system.low, system.up)
     size = lambda v: _norms(spaces[1], array(v, u0.shape))  # noqa: E731
-    residual, step = (
-        size(projection_step / tau - projection_step @ system.M.T),
-        size(projection_step),
-    )
+    of_w = np.reshape(np.array([r.of_w for r in rows]), (len(rows), m))
+    residual = size(projection_step / tau - projection_step @ system.M.T) + size(of_w)
+    step = size(projection_step)
     gamma, norm_P_inv = setup.moduli.get("gamma"), setup.moduli.get("norm_P_inv")
     error = None
     if gamma is not None and norm_P_inv is not None:

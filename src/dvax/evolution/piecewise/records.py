@@ -42,7 +42,8 @@ class Row(NamedTuple):
 
     - `defect`: the integrated defect of both equations up to the end of the step that contains t;
     - `completed_defect`: the same up to the start of that step;
-    - `bounds`: bounds (low, high) on x and y up to the end of that step, None if they are not tracked.
+    - `bounds`: bounds (low, high) on x and y since the saved time before, None if they are not tracked;
+    - `of_w`: a bound on the error of w, if the defect is measured, else 0.
     """
 
     t: float
@@ -52,6 +53,7 @@ class Row(NamedTuple):
     defect: tuple[float, float]
     completed_defect: tuple[float, float]
     bounds: Array | None
+    of_w: Array
 
 
 class Crossing(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from .. import meter
 from ..setup import Options
 from . import radau
-from .defect import Norms, Polynomials, step_defect
+from .defect import Norms, Polynomials, law_rounding, step_defect
 from .inputs import Piece, basis, is_continuous, values
 from .lengths import length_past, lengthen, shorten, two_sum
 from .modes import Condition, Equations, Mode, initial_mode, mode_after
@@ -371,14 +371,16 @@ class Run:
             x, y = step.evaluate(thetas)
             q = self.piece.evaluate((begin + thetas * step.length) / piece.length)[:, n:]
             w = y @ self.original.M.T + x @ self.original.C.T + q
-            defect = self.defect + of_row, self.law_defect
+            defect, of_w = (self.defect + of_row, self.law_defect), np.zeros_like(w)
+            if self.measure:
+                of_w = law_rounding(self.original, x, y, q) + self.piece.uncertainty()[n:]
             # The start of the run is exact.
             starts = (self.accepted == 1) & (thetas == 0.0)
             self.rows += [
                 Row(
                     float(self.times[first + k]), self.x if starts[k] else x[k], y[k], w[k],
                     (0.0, 0.0) if starts[k] else defect, completed_defect,
-                    None if bounds is None else bounds[k],
+                    None if bounds is None else bounds[k], of_w[k],
                 )
                 for k in range(len(offsets))
             ]  # fmt: skip
