@@ -112,8 +112,9 @@ def run(full: bool) -> Section:
             "converter with it), in a process with one BLAS thread, as that of Siconos. dvax solves "
             "to roundoff at any tolerance, so that no row has equal errors unless the resistance of "
             "the diodes is the error; the ratio belongs with both errors. Bounds are those of "
-            "dvax.bound_error in √J over the root of the capacity of C1, for the circuit with r_on "
-            "and g_leak. The distance from there to ideal diodes is that of two exact solutions. "
+            "dvax.bound_error in √J over the root of the capacity of C1, of the converter by "
+            "constants and of the others along the trajectory, for the circuit with r_on and "
+            "g_leak. The distance from there to ideal diodes is that of two exact solutions. "
             "BuckConverter: errors of the inductor's current, of dvax against the exact solution "
             "with its leak, of Siconos (equations, step and solver of the tutorial) against that "
             "with half of the leak, since the tutorial has none."
@@ -157,7 +158,7 @@ def _published(
     exact, own = given.exact(ts), given.own(ts)
     row = [given.file, _error_of_file(section, name, given, ts, exact)]
     with DvaxCircuits() as dvax:
-        dvax.load(ts, netlist=given.netlist, **given.options)
+        dvax.load(ts, netlist=given.netlist, along=True, **given.options)
         found = dvax.result()
         xs, bound = found["xs"], found["bound"] / 1e-3
         error, own_error = _largest(xs, exact, ts), float(np.abs(xs - own)[:, 0].max())

@@ -3,7 +3,8 @@
 It is a process of its own so that NumPy's small factorisations run on one thread, as those of Siconos
 do, and so that its memory can be told. Run it from the repository's root as a module.
 
-    {"do": "load", "netlist": ..., "r_on": ..., "g_leak": ..., "ts": [...]}    a netlist, or
+    {"do": "load", "netlist": ..., "r_on": ..., "g_leak": ..., "along": ..., "ts": [...]}    a netlist,
+        with its bound along the trajectory or by constants, or
     {"do": "load", "buck": G, "ts": [...]}    the converter of `buck_converter.py`
     {"do": "run"}     ->  {"seconds": ...}    from t = 0 to the last of ts, saved there alone
     {"do": "result"}  ->  {"seconds": ..., "xs": [...], "bound": ..., "status": ...,
@@ -50,9 +51,10 @@ def prepare(order: dict[str, Any]) -> tuple[Callable[..., dvax.Solution], Callab
 
         return solve, lambda sol: dvax.bound_error(system, sol, constants)
     circuit = Circuit(order["netlist"], r_on=order.get("r_on"), g_leak=order.get("g_leak"))
+    constants = None if order.get("along") else circuit.constants
     return (
         lambda ts: circuit.solve(end, ts, **_SETTINGS),
-        lambda sol: dvax.bound_error(circuit.problem, sol, circuit.constants),
+        lambda sol: dvax.bound_error(circuit.problem, sol, constants),
     )
 
 

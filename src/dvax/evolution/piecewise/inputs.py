@@ -214,9 +214,9 @@ def build_pieces(
         return np.min(_INTERPOLATION[:, None] * radii, axis=1)
 
     bounds = errors(0.0)
-    is_whole = np.isfinite(bounds).all(axis=1)
+    is_whole = np.all(np.isfinite(bounds), axis=1)
     if not is_whole.all():
-        bounds = np.where(is_whole[:, None], bounds, errors(edge))
+        bounds = np.where(np.expand_dims(is_whole, 1), bounds, errors(edge))
     edge = np.where(is_whole, 0.0, edge)
     # A piece of some roundings of t next to a knot has a value of one side or of the other.
     sizes = np.pad(np.abs(c).sum(axis=1), ((1, 1), (0, 0)))
