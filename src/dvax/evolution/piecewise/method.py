@@ -24,9 +24,11 @@ class PiecewiseLinear(eqx.Module):
     ≥ 10⁻⁸. Where roundoff is larger, it is at most a tenth of the tolerance. Shorter steps do not
     reduce the roundoff of a law. If y or w violates a bound by less than this roundoff, the constraint
     stays unchanged and the violation is added to the defect. The run ends with a `dvax.SolveError` if
-    the violation could change the state by more than the tolerance. In `Solution.stats`, `switchings`
-    counts the changes, and `evaluations` the linear solves. The method runs on the host in NumPy,
-    outside of `jax.jit` and without derivatives; there, use `dvax.ExpRosenbrock` for the same systems.
+    the violation could change the state by more than the tolerance. With `constants=` or `measure=True`
+    the defect is enclosed, rounding errors included, so that bounds are proved. In `Solution.stats`,
+    `switchings` counts the changes, and `evaluations` the linear solves. The method runs on the host in
+    NumPy, outside of `jax.jit` and without derivatives; there, use `dvax.ExpRosenbrock` for the same
+    systems.
 
     **Raises:** `dvax.InputError` if the structure cannot be proved from the code of f, h and K, for
     more than 64 states or responses, or with `dt`; `dvax.DifferentiationError` for traced values;
