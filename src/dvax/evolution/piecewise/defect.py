@@ -133,8 +133,8 @@ _CHUNK = 256
 
 
 class StepDefect(NamedTuple):
-    """Bounds on ∫‖δ‖ and on the integrated perturbation of the law over a step, and on the rounding
-    error of x at a saved time."""
+    """Bounds on ∫‖δ‖ and on the integrated perturbation of the law over a step, and on the distance of
+    a computed x in it from x_c."""
 
     state: float
     law: float
@@ -184,7 +184,8 @@ def step_defect(
     found = []
     for state, distance, z in sorted(charged, key=lambda one: one[0]):
         of_state, of_law = law.violations(norms, distance, z)
-        found.append(StepDefect(state + of_start + of_state, of_law, of_row))
+        at_row = of_row + _norm(norms.x, distance)
+        found.append(StepDefect(state + of_start + of_state, of_law, at_row))
         if of_law == 0.0:
             break
     gain = _gain(system, norms) if len(found) > 1 else 0.0
