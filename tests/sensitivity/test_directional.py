@@ -328,11 +328,9 @@ def test_sets_that_do_not_show_their_kinks_are_refused():
     boxes = dvax.sets.Intersection(dvax.sets.Box(0.0, jnp.inf), dvax.sets.Box(-1.0, 1.5))
     found = [
         dvax.directional_derivative(
-            weakly_active(K), jnp.array([-0.2, -0.5]), 0.0, 1.0, dx0=jnp.array([1.0, d])
+            weakly_active(K), jnp.array([-0.2, -0.5]), 0.0, 1.0, dx0=jnp.array([1.0, -1.0])
         )
         for K in (boxes, dvax.sets.Box(0.0, 1.5))
-        for d in (1.0, -1.0)
     ]
-    for one, other in zip(found[:2], found[2:], strict=True):
-        np.testing.assert_array_equal(one.dus, other.dus)
-        assert len(one.kinks) == len(other.kinks) == 1
+    np.testing.assert_array_equal(found[0].dus, found[1].dus)
+    assert len(found[0].kinks) == len(found[1].kinks) == 1

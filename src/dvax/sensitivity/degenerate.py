@@ -98,9 +98,8 @@ def kinks(sol: Solution, *, tol: float = 1e-6) -> list[Kink]:
 
 def require_switches(place: str, setup: Setup) -> None:
     """Raise an `InputError` where no functions of the set change sign at the kinks."""
-    problem, x0, args = setup.problem, setup.x0, _tree.as_arrays(setup.args)
-    K, like = problem.set_at(setup.number("t0"), args), problem.zero_control(x0)
-    if K.switches(like, problem.spaces(x0)[1]) is None:
+    if switch_count(setup) is None:
+        K = setup.problem.set_at(setup.number("t0"), _tree.as_arrays(setup.args))
         raise input_error(
             place, f"a law on {type(K).__name__}",
             "Dykstra's method does not determine which sets of an Intersection are active, so that "

@@ -27,7 +27,7 @@ from ..evolution import AbstractMethod, Solution, solve
 from ..problem import Problem
 from ..signals import Table, listen
 from .critical import activity, critical_cone
-from .degenerate import Kink, kinks
+from .degenerate import Kink, kinks, require_switches
 from .newton import OneSided
 
 
@@ -155,6 +155,7 @@ def directional_derivative(
     dx0 = jtu.tree_map(lambda d, a: d.astype(a.dtype), dx0, x0)
     settings: dict[str, Any] = dict(rtol=rtol, atol=atol, max_steps=max_steps, method=method)
     sol = solve(problem, x0, t0, t1, args, ts, dense=True, **settings)
+    require_switches("dvax.directional_derivative(problem)", sol.setup)
     base_kinks = kinks(sol, tol=tol)
     begin, end = float(t0), float(t1)
     inner = [t for kink in base_kinks for t in (kink.start, kink.end) if begin < t < end]
