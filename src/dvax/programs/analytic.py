@@ -362,7 +362,11 @@ def _remainder(eqn: Any, operands: list[Any]) -> Any:
 def _converted(eqn: Any, operands: list[Any]) -> Any:
     v, out = operands[0], eqn.outvars[0].aval
     if is_real(out):
-        return _lifted(v)
+        # With fewer digits the result is a step function.
+        is_shorter = (
+            isinstance(v, Analytic) and jnp.finfo(v.center.dtype).bits > jnp.finfo(out.dtype).bits
+        )
+        return _unknown(eqn, operands) if is_shorter else _lifted(v)
     if isinstance(v, Analytic):
         if out.dtype == jnp.bool_:
             return _unknown(eqn, operands)
@@ -466,7 +470,7 @@ RULES: dict[str, Rule] = {
     "convert_element_type": _converted,
     "dot_general": _matrix_product,
     **same_for({"concatenate", "stack"}, _joined),
-    **same_for(REARRANGING | SUMMING | {"reduce_precision"}, _linear),
+    **same_for(REARRANGING | SUMMING, _linear),
     **same_for({"gather", "dynamic_slice"}, _indexed),
     **same_for(COMPARING, _compared),
     **same_for(LOGICAL, _whole_numbers),

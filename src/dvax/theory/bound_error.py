@@ -31,9 +31,11 @@ def bound_error(
 
     **Without constants** the bound is proved along the trajectory, in tubes around pieces of it, from
     the code of f and h: no region has to be given, and errors grow in the bound as those of the
-    linearised system do. The problem is solved once more for this, by `ETD2RK` with tolerances of
-    10⁻⁹ to 10⁻⁵, and the distance of `sol` from this run is added: `sol` may be of any method. Where
-    this run would take more than `max_steps`, its tolerances become up to 100 times larger.
+    linearised system do. The problem is solved once more for this, and the distance of `sol` from this
+    run is added: `sol` may be of any method. The run is one of `PiecewiseLinear` where that solved
+    `sol`, or can solve the problem and x and u have at most 16 unknowns; otherwise it is one of
+    `ETD2RK` with tolerances of 10⁻⁹ to 10⁻⁵, which become up to 100 times larger where it would take
+    more than `max_steps`.
     `x_paper` is then the bound that the constants of each piece give with the bound at its start, and
     `x_sharp` is `x`. With more than 128 unknowns errors grow at the rates of these constants. Where
     `ETD2RK` samples its defect, as for a set whose motion has no rule, the bound is an estimate.

@@ -20,10 +20,11 @@ violation of y is a distance of y from K, and one of w perturbs the law.
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numpy.polynomial import chebyshev
 
 from . import radau
-from .inputs import Piece
+from .inputs import Piece, basis
 from .modes import Equations, inverse
 from .system import Affine
 
@@ -346,7 +347,7 @@ def _propagated(
     b = scale[:, None] * columns
     s = length * 0.5**halvings
     first = sum(np.linalg.norm(b, axis=0)) * s * np.exp(growth * s)
-    factor, of_columns, largest = _exponential(C * s), float(first), float(np.exp(growth * s))
+    factor, of_columns, largest = scipy.linalg.expm(C * s), float(first), float(np.exp(growth * s))
     error = float(np.linalg.norm(rounding)) + len(C) * 32.0 * _EPS * float(np.linalg.norm(C))
     for _ in range(halvings):
         more = np.exp(growth * s)
@@ -356,14 +357,6 @@ def _propagated(
         largest = max(largest, here * more)
         factor, s = factor @ factor, 2.0 * s
     return _Propagation(of_columns, largest)
-
-
-def _exponential(M: Array) -> Array:
-    """Return e^M for a matrix of norm ≤ 1/4."""
-    found = eye = np.eye(len(M))
-    for k in range(12, 0, -1):
-        found = eye + (M @ found) / k
-    return found
 
 
 def _rest(M: Array, size: Array, approximate: Array, residual: Array) -> float:
@@ -400,7 +393,7 @@ def _violation(row: Array, waves: list[radau.Wave], slack: float) -> float:
     return float((b - a) @ violation)
 
 
-_ON_GRID = chebyshev.chebvander(2.0 * radau.GRID - 1.0, radau.STAGES)
+_ON_GRID = basis(radau.GRID)
 _MAX_DIVISIONS, _MAX_INTERVALS, _PARTS = 12, 32, np.linspace(0.0, 1.0, 17)
 
 

@@ -24,11 +24,11 @@ _POINTS = np.cos(np.pi * (np.arange(STAGES + 1) + 0.5) / (STAGES + 1))
 _TO_COEFFICIENTS = np.linalg.inv(np.polynomial.chebyshev.chebvander(_POINTS, STAGES))
 _LINE_SAMPLES = np.array([-0.93, -0.5441, 0.0713, 0.4129, 0.8537])
 _CHECK_POINTS = np.array([-0.9871, -0.4127, 0.0317, 0.3719, 0.8853])
-_SAMPLE_ROUNDOFF = 8.0
-"""Rounding error of a sample in the same units, if the code of f and h is exact to a few of them."""
-
 _ROUNDOFF_FACTOR = 64.0
 """Bound on the rounding error of a sample, in units of eps times the size of t and of the value."""
+
+_SAMPLE_ROUNDOFF = 8.0
+"""The same if the code of f and h is exact to a few roundings."""
 
 
 class Piece(NamedTuple):
@@ -112,16 +112,18 @@ def _samples(problem: Problem, args: Any, x: Tree, u: Tree, ts: Any) -> Any:
 
 
 @eqx.filter_jit
-def _radii(problem: Problem, args: Any, x: Tree, u: Tree, low: Any, high: Any) -> Any:
-    """Return bounds on (g, q), up to constants, in discs around intervals of t: one row per interval
-    and per ρ."""
+def _radii(problem: Problem, args: Any, x: Tree, u: Tree, low: Any, high: Any, length: Any) -> Any:
+    """Return bounds on (g, q), up to constants, in discs that contain the ellipses of pieces of this
+    length; `low` and `high` are the ends of the real times that decide branches. One row per piece and
+    per ρ."""
 
-    def one(low: Any, high: Any, rho: Any) -> Any:
-        reach = 0.25 * (high - low) * (rho + 1.0 / rho)
+    def one(low: Any, high: Any, length: Any, rho: Any) -> Any:
+        reach = 0.25 * length * (rho + 1.0 / rho)
         return complex_radius(lambda t: _inputs(problem, args, x, u, t), low, high, reach)
 
-    rows = jax.vmap(one, in_axes=(None, None, 0))
-    return jax.vmap(rows, in_axes=(0, 0, None))(low, high, jnp.asarray(_ELLIPSES, low.dtype))
+    rows = jax.vmap(one, in_axes=(None, None, None, 0))
+    ellipses = jnp.asarray(_ELLIPSES, low.dtype)
+    return jax.vmap(rows, in_axes=(0, 0, 0, None))(low, high, length, ellipses)
 
 
 def _inputs(problem: Problem, args: Any, x: Tree, u: Tree, t: Any) -> jax.Array:
@@ -206,11 +208,12 @@ def build_pieces(
     c = np.einsum("ij,kjl->kil", _TO_COEFFICIENTS, sample(starts, lengths, _POINTS))
     # The inputs may have other values at the knots themselves, up to a few roundings of t.
     rounding = _EDGE * eps * (np.abs(starts) + lengths)
-    edge = np.minimum(rounding, 0.01 * lengths)
+    edge = np.minimum(rounding, _MAX_EDGE * lengths)
 
     def errors(edge: Any) -> Array:
-        ends = (jnp.asarray(_padded(v), dtype) for v in (starts + edge, starts + lengths - edge))
-        radii = np.asarray(_radii(problem, args, x, u, *ends), float)[: len(pieces)]
+        numbers = starts + edge, starts + lengths - edge, lengths
+        padded = (jnp.asarray(_padded(v), dtype) for v in numbers)
+        radii = np.asarray(_radii(problem, args, x, u, *padded), float)[: len(pieces)]
         return np.min(_INTERPOLATION[:, None] * radii, axis=1)
 
     bounds = errors(0.0)
@@ -218,27 +221,23 @@ def build_pieces(
     if not is_whole.all():
         bounds = np.where(np.expand_dims(is_whole, 1), bounds, errors(edge))
     edge = np.where(is_whole, 0.0, edge)
-    # A piece of some roundings of t next to a knot has a value of one side or of the other.
+    # Next to a knot, within some roundings of t, the inputs have values of one side or of the other.
     sizes = np.pad(np.abs(c).sum(axis=1), ((1, 1), (0, 0)))
     around = sizes[:-2] + sizes[1:-1] + sizes[2:]
-    bounds = np.where((lengths <= 4.0 * rounding)[:, None], around, bounds)
-    return [
-        _proved(piece, of_interpolant, row, float(share))
-        for piece, of_interpolant, row, share in zip(pieces, bounds, c, edge / lengths, strict=True)
-    ]
+    is_short = ~np.isfinite(bounds) & np.expand_dims(lengths <= 4.0 * rounding, 1)
+    bounds = np.where(is_short & (len(pieces) > 1), around, bounds)
+    bounds = bounds + 4.0 * np.expand_dims(edge / lengths, 1) * around
+    return [_proved(*one) for one in zip(pieces, bounds, c, strict=True)]
 
 
-def _proved(piece: Piece, of_interpolant: Array, c: Array, edge: float) -> Piece:
+def _proved(piece: Piece, of_interpolant: Array, c: Array) -> Piece:
     """Return a piece with a proved error, if that of the polynomial with the coefficients c that
-    interpolates the inputs is finite; `edge`: the part of the piece next to each end of it that is not
-    examined."""
+    interpolates the inputs is finite."""
     if not np.isfinite(of_interpolant).all():
         return piece
     apart = c.copy()
     apart[: len(piece.coefficients)] -= piece.coefficients
-    size = np.abs(c).sum(axis=0)
-    error = of_interpolant + np.abs(apart).sum(axis=0) + 4.0 * edge * size
-    return piece._replace(error=error, is_proved=True)
+    return piece._replace(error=of_interpolant + np.abs(apart).sum(axis=0), is_proved=True)
 
 
 def _padded(values: Array) -> Array:
@@ -252,7 +251,9 @@ _ELLIPSES = np.array([2.0, 3.0, 5.0, 8.0, 13.0, 21.0, 50.0])
 _INTERPOLATION = 4.0 * _ELLIPSES**-STAGES / (_ELLIPSES - 1.0)
 """The error of interpolation in Chebyshev points, for a function of modulus ≤ 1 in each ellipse."""
 
-_EDGE = 256.0
+_EDGE, _MAX_EDGE = 256.0, 1e-3
+"""Length next to a knot that branches of the code are not decided for: roundings of t, and at most this
+part of a piece, which is less than the distance of the first Chebyshev point."""
 
 
 def _close_gaps(pieces: list[Piece]) -> list[Piece]:
