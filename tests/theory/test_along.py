@@ -283,9 +283,15 @@ def test_a_solution_in_parts_has_the_bound_of_the_whole(family):
     assert (np.linalg.norm(np.asarray(sol.xs - exact.xs), axis=1) <= joined + 1e-11).all()
     # Pieces are as long as they are for the whole solution.
     np.testing.assert_allclose(joined, whole, rtol=1e-12)
-    if family is spring:  # its run in modes has few steps
-        return
-    # With less work than that, the tolerance is larger, and the bound too.
+
+
+@pytest.mark.slow
+def test_a_bound_with_less_work_has_a_larger_tolerance():
+    system, x0 = van_der_pol(FAMILIES[van_der_pol][1])
+    sol = dvax.solve(system, x0, 0.0, 4.0, ts=np.linspace(0.0, 4.0, 41))
+    parts = [cut(sol, slice(k, k + 10)) for k in range(0, 41, 10)]
+    follower = BoundAlong(system, sol, np.asarray(sol.ts), 4.0)
+    follower.bound(sol)
     work = follower.steps // 2
     half = BoundAlong(system, sol, np.asarray(sol.ts), 4.0, max_steps=work)
     half_bound = half.bound(sol)

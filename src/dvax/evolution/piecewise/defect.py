@@ -172,7 +172,7 @@ def step_defect(
     for total, distance in ((of_polynomial.total, no_distance), (of_integral, apart)):
         z, columns = law.correction(np.abs(system.C) @ distance)
         of_z = np.abs(columns).sum(axis=1)
-        charged.append((total + part.length * _norm(norms.x, beside + of_z), distance, z))
+        charged.append((total + part.length * norm(norms.x, beside + of_z), distance, z))
     if min(charged, key=lambda found: found[0])[0] > 4.0 * of_polynomial.jumps:
         _, columns = law.correction(np.zeros(m))
         columns = np.hstack([columns, np.diag(of_polynomial.largest + beside)])
@@ -181,11 +181,11 @@ def step_defect(
         distance = total / norms.x
         charged.append((total, distance, law.correction(np.abs(system.C) @ distance)[0]))
     row = sum((abs(r) * part.length * np.abs(v) for r, v, _ in part.waves), part.size())
-    of_start, of_row = _norm(norms.x, jumps), _norm(norms.x, _SUM * row)
+    of_start, of_row = norm(norms.x, jumps), norm(norms.x, _SUM * row)
     found = []
     for state, distance, z in sorted(charged, key=lambda one: one[0]):
         of_state, of_law = law.violations(norms, distance, z)
-        at_row = of_row + _norm(norms.x, distance)
+        at_row = of_row + norm(norms.x, distance)
         found.append(StepDefect(state + of_start + of_state, of_law, at_row))
         if of_law == 0.0:
             break
@@ -220,8 +220,8 @@ def _of_polynomial(
     jumps = 0.0
     for row, value in ((c * _SIGNS[:-1, None], first), (c, last)):
         at_end, error = _running(row)
-        jumps += _norm(norms.x, np.abs(at_end - value) + error + _EPS * np.abs(value))
-    total = part.length * (mean + _norm(norms.x, rounding)) + jumps
+        jumps += norm(norms.x, np.abs(at_end - value) + error + _EPS * np.abs(value))
+    total = part.length * (mean + norm(norms.x, rounding)) + jumps
     return _OfPolynomial(float(total), _sum(residual) + rounding, jumps)
 
 
@@ -240,8 +240,8 @@ def _of_integral(
     at_end, error = _running(own)
     jump = np.abs((first + at_end) - last) + error + _SUM * own_size.sum(axis=0)
     jump += _EPS * (np.abs(first) + np.abs(last))
-    total = part.length * _norm(norms.x, np.abs(system.A) @ distance + rounding)
-    return float(total + _norm(norms.x, jump)), distance
+    total = part.length * norm(norms.x, np.abs(system.A) @ distance + rounding)
+    return float(total + norm(norms.x, jump)), distance
 
 
 def law_rounding(system: Affine, x: Array, y: Array, q: Array) -> Array:
@@ -407,5 +407,6 @@ def _sum(c: Array) -> Array:
     return np.abs(c).sum(axis=0)
 
 
-def _norm(weights: Array, v: Array) -> float:
+def norm(weights: Array, v: Array) -> float:
+    """Return the norm of v = Σ vᵢeᵢ, where the unit vectors eᵢ have the norms `weights`."""
     return float(np.sqrt(np.sum((weights * v) ** 2)))

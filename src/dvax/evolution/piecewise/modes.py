@@ -208,11 +208,9 @@ class Equations:
             x0 = x0 - 2.0 * parts[-1][1].real
         return parts, x0
 
-    def residuals(
-        self, x: Array, p: Array, given: Array, h: float, B: Array
-    ) -> tuple[Array, Array]:
-        """Return the residuals at θ = 0 of the state equation and of the law, reduced by bounds on
-        their rounding errors. `given` holds (g, q) at θ = 0."""
+    def start_residual(self, x: Array, p: Array, given: Array, h: float, B: Array) -> Array:
+        """Return the residual of the state equation at θ = 0, reduced by bounds on its rounding errors.
+        `given` holds (g, q) at θ = 0."""
         system, n = self.system, x.shape[1]
         p0 = radau.POINTS_TO_START @ p
         rate = radau.D[0] @ x / h
@@ -225,14 +223,13 @@ class Equations:
         noise = _RESIDUAL_ROUNDOFF * (
             np.abs(system.M) @ sizes + np.abs(system.C) @ np.abs(x).max(axis=0) + np.abs(given[n:])
         )
-        law = np.where(self.unknown, np.maximum(law - noise, 0.0), 0.0)
         # Where y is prescribed, use its exact value and count the difference in the state equation.
-        of_y = np.where(system.swapped, law, 0.0)
-        state = np.maximum(error - rounding, 0.0) + np.abs(B) @ of_y
-        return state, law - of_y
+        is_counted = self.unknown & system.swapped
+        of_y = np.where(is_counted, np.maximum(law - noise, 0.0), 0.0)
+        return np.maximum(error - rounding, 0.0) + np.abs(B) @ of_y
 
-    def start_residual(self, of_x: Array, of_p: Array) -> Array:
-        """Return a bound on the residual of the state equation that errors of x and p cause."""
+    def start_error(self, of_x: Array, of_p: Array) -> Array:
+        """Return a bound on that residual which errors of x and p cause."""
         return np.abs(self.system.A) @ of_x + np.abs(self.system.B) @ of_p
 
     def response(self, oscillation: Oscillation) -> tuple[Array, Array]:

@@ -244,8 +244,3 @@ def _bisect(value: Callable[[float], float], a: float, b: float) -> float:
         if middle in (a, b):
             return a
         a, b = (middle, b) if value(middle) > 0.0 else (a, middle)
-
-
-def mean_residual(used: float) -> float:
-    """Return a bound on the mean of |ρ| on [0, used], relative to |ρ(0)|."""
-    return min(1.0, MEAN_RESIDUAL / used) if used > 0.0 else 1.0

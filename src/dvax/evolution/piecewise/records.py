@@ -63,17 +63,6 @@ class Crossing(NamedTuple):
     length: float
 
 
-class MaskedViolation(NamedTuple):
-    """Violations of bounds that are smaller than the slack, averaged over a step.
-
-    `violation` has a row for y and a row for w. `state_error` estimates how much the state would change
-    if the constraints switched.
-    """
-
-    violation: Array
-    state_error: Array
-
-
 class Attempt(NamedTuple):
     """A computed step, before the error test and the event location.
 
@@ -83,8 +72,7 @@ class Attempt(NamedTuple):
     - `oscillations`: (λ, x, y, w) of the terms in closed form; `amplitude` bounds them in y and in w;
     - `size`: the largest |x|; `noise`: the rounding error of x;
     - `truncation`: the estimated truncation error of x;
-    - `error_ratio`: the largest estimated error relative to the allowed one;
-    - `residuals`: the residuals of the state equation and of the law at θ = 0.
+    - `error_ratio`: the largest estimated error relative to the allowed one.
     """
 
     x: Array
@@ -98,7 +86,6 @@ class Attempt(NamedTuple):
     noise: Array
     truncation: Array
     error_ratio: float
-    residuals: tuple[Array, Array]
 
     def waves(self, k: int, i: int) -> list[tuple[complex, complex]]:
         """Return (λ, amplitude) of the oscillations in entry i of y (k = 0) or of w (k = 1)."""

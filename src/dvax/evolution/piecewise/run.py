@@ -15,13 +15,13 @@ import numpy as np
 from .. import meter
 from ..setup import Options
 from . import radau
-from .defect import Norms, Polynomials, law_rounding, step_defect
+from .defect import Norms, Polynomials, law_rounding, norm, step_defect
 from .inputs import Piece, basis, is_continuous, values
 from .lengths import length_past, lengthen, shorten, two_sum
 from .modes import Condition, Equations, Mode, initial_mode, mode_after
 from .murty import implicit_mode, law_mode
-from .records import Attempt, Crossing, MaskedViolation, Row, Step
-from .signs import locate_event, masked_violation
+from .records import Attempt, Crossing, Row, Step
+from .signs import locate_event, masked_error
 from .system import Affine
 
 Array = np.ndarray
@@ -149,7 +149,7 @@ class Run:
                     h, last_ratio = shorter_length, np.inf
                 else:
                     accepted = attempt
-            self.masked_error = self.masked_error + masked.state_error
+            self.masked_error = self.masked_error + masked
             is_full = condition is None and theta == 1.0 and bool(h == remaining)
             end = piece.length if is_full else begin + (low + theta * h)
             self._accept(
@@ -203,10 +203,10 @@ class Run:
                 return "nonfinite"
             unlimited = np.full(len(mode), np.inf)
             attempt = attempt._replace(slack=(unlimited, unlimited))
-            masked = masked_violation(self.equations_of, self.original, equations, attempt, 1.0, h)
+            masked = masked_error(self.equations_of, self.original, equations, attempt, 1.0, h)
             if attempt.error_ratio <= 1.0 and self._is_negligible(masked, attempt):
                 self._switch(mode)
-                self.masked_error = self.masked_error + masked.state_error
+                self.masked_error = self.masked_error + masked
                 self._accept(attempt, h, 1.0, piece, begin, low, begin + (low + h), False)
                 begin, low = two_sum(begin, low + h)
                 self.crossing, self.switches_here = Crossing(begin + low, h), 0
@@ -289,24 +289,24 @@ class Run:
             np.minimum(slack[0], _MAX_SLACK * (self.rtol * largest[0] + self.atol)),
             np.minimum(slack[1], _MAX_SLACK * (self.rtol * largest[1] + self.atol * of_w)),
         )
-        residuals = equations.residuals(x, p, G[0], h, self.original.B)
+        residual = equations.start_residual(x, p, G[0], h, self.original.B)
         # Limit the contribution of a boundary layer to the defect, which error bounds are made of.
         max_defect = _MAX_STEP_DEFECT * (self.rtol * energy + self._norm(np.full(n, self.atol)))
         # Subtract the part due to roundoff at the start, which a shorter step does not reduce.
         p_error = np.abs(radau.POINTS_TO_START) @ (noise_p + solved.carried_p)
-        rounded = equations.start_residual(self.x_error, p_error)
-        layer = h * radau.mean_residual(1.0) * self._norm(np.maximum(residuals[0] - rounded, 0.0))
+        rounded = equations.start_error(self.x_error, p_error)
+        layer = h * radau.MEAN_RESIDUAL * self._norm(np.maximum(residual - rounded, 0.0))
         error_ratio = max(error_ratio, layer / (max_defect + tiny))
         return Attempt(
             x, ys, y, w, slack, oscillations, amplitude, sizes[0], noise_x.max(axis=0), truncation,
-            error_ratio, residuals,
+            error_ratio,
         )  # fmt: skip
 
     def _locate_event(
         self, equations: Equations, attempt: Attempt, h: float
-    ) -> tuple[Attempt, float, Condition | None, MaskedViolation]:
+    ) -> tuple[Attempt, float, Condition | None, Array]:
         """Return the attempt with its slack, θ and the condition of the first switching, and the
-        violations that the slack masks up to θ.
+        effect on x of the violations that the slack masks up to θ.
 
         The slack prevents roundoff from reversing a switching. If the masked violations could matter to
         the state, try less slack, and finally none: the signs are then those of the polynomials.
@@ -314,16 +314,16 @@ class Run:
         for share in _SLACK_FACTORS:
             trial = attempt._replace(slack=(share * attempt.slack[0], share * attempt.slack[1]))
             theta, condition = locate_event(equations, trial, h)
-            masked = masked_violation(self.equations_of, self.original, equations, trial, theta, h)
+            masked = masked_error(self.equations_of, self.original, equations, trial, theta, h)
             if self._is_negligible(masked, trial):
                 break
         return trial, theta, condition, masked
 
-    def _is_negligible(self, masked: MaskedViolation, attempt: Attempt) -> bool:
+    def _is_negligible(self, masked: Array, attempt: Attempt) -> bool:
         """Return whether masked violations use a small part of the remaining tolerance."""
         allowed = self.rtol * np.maximum(self.scale, attempt.size) + self.atol
         remaining = np.maximum(allowed - self.masked_error, 0.0)
-        return bool(np.all(masked.state_error <= _MASKED_SHARE * remaining))
+        return bool(np.all(masked <= _MASKED_SHARE * remaining))
 
     def _accept(
         self, attempt: Attempt, h: float, theta: float, piece: Piece, begin: float, low: float,
@@ -407,8 +407,8 @@ class Run:
         return found
 
     def _norm(self, v: Array) -> float:
-        """Return an upper bound of the norm of the state space, exact for orthogonal unit vectors."""
-        return float(np.sqrt(np.sum((self.weights * v) ** 2)))
+        """Return the norm of an element of the state space."""
+        return norm(self.weights, v)
 
 
 _AT_POINTS, _ON_GRID, _START = (basis(v) for v in (radau.POINTS, radau.GRID, np.zeros(1)))

@@ -6,7 +6,7 @@ import numpy as np
 
 from . import radau
 from .modes import Condition, Equations, Mode, mode_after
-from .records import Attempt, MaskedViolation
+from .records import Attempt
 from .system import Affine
 
 
@@ -34,16 +34,17 @@ def locate_event(
     return theta, first
 
 
-def masked_violation(
+def masked_error(
     equations_of: Callable[[Mode], Equations],
     system: Affine,
     equations: Equations,
     attempt: Attempt,
     theta: float,
     h: float,
-) -> MaskedViolation:
-    """Return the mean violations of bounds up to θ that the slack masks, and their effect on x."""
-    violation, state_error = np.zeros((2, len(equations.mode))), np.zeros(attempt.x.shape[1])
+) -> np.ndarray:
+    """Return an estimate of how much x would change if the constraints switched that the slack holds
+    up to θ, from their mean violations."""
+    state_error = np.zeros(attempt.x.shape[1])
     before = radau.GRID <= theta
     thetas = radau.GRID[before]
     # Use the weights of the trapezoidal rule: the samples are denser at the ends.
@@ -54,7 +55,6 @@ def masked_violation(
         for rate, amplitude in attempt.waves(k, c.i):
             value = value + 2.0 * np.real(amplitude * np.exp(rate * h * thetas))
         mean = np.average(np.clip(-c.sign * value, 0.0, attempt.slack[k][c.i]), weights=weights)
-        violation[k, c.i] = mean
         if mean > 0.0:
             # In the mode after a switching, a negative residual w becomes a response w/M. The gain of
             # that mode gives the effect of the response on the state.
@@ -65,4 +65,4 @@ def masked_violation(
                 ]
                 * response
             )
-    return MaskedViolation(violation, state_error)
+    return state_error
